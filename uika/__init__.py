@@ -1,0 +1,1 @@
+"""UIKA on Dr.Jit."""
