@@ -1,0 +1,9 @@
+import pytest
+
+from tests.heads import sphere_head
+from uika.head import HeadModel
+
+
+@pytest.fixture(scope="session")
+def head() -> HeadModel:
+    return sphere_head()

@@ -1,0 +1,29 @@
+"""The parametric head: its model, parameters, posing, cameras, rasterizer, UV atlas and Gaussian binding."""
+
+from uika.head.camera import Camera, look_at, orbit, project
+from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel, load_head, save_arrays, save_head
+from uika.head.parameters import HeadParameters
+from uika.head.posing import joint_transforms, pose_vertices, rest_joints, rodrigues, shaped_vertices, vertex_normals
+from uika.head.raster import rasterize
+
+__all__ = [
+    "JOINT_NAMES",
+    "JOINT_PARENTS",
+    "Camera",
+    "HeadError",
+    "HeadModel",
+    "HeadParameters",
+    "joint_transforms",
+    "load_head",
+    "look_at",
+    "orbit",
+    "pose_vertices",
+    "project",
+    "rasterize",
+    "rest_joints",
+    "rodrigues",
+    "save_arrays",
+    "save_head",
+    "shaped_vertices",
+    "vertex_normals",
+]
