@@ -1,0 +1,6 @@
+"""Photos in: reading, face detection, cropping and matting."""
+
+from uika.photo.error import PhotoError
+from uika.photo.prepare import Photo, prepare
+
+__all__ = ["Photo", "PhotoError", "prepare"]

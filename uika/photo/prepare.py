@@ -1,0 +1,137 @@
+"""From a photo file to the square, matted, landmarked crop that the rest of the program works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from uika.photo import matte
+from uika.photo.crop import Square, coverage, resample, to_crop
+from uika.photo.detect import find_face
+from uika.photo.error import PhotoError
+from uika.photo.nets import person_mask
+from uika.photo.outline import CHIN, FOREHEAD, OVAL, polygon
+from uika.photo.read import Picture, read
+
+HEAD_TO_FACE = 1.35  # height of a head over the height of its face, forehead line to chin
+CROP_TO_HEAD = 1.5  # side of the crop over the larger side of the head box (released inference settings)
+HAIR_LIMIT = 1.0  # hair is looked for up to this many face heights beyond the face
+SCAN_SIDE = 256  # pixels, the resolution of the segmentation model
+MIN_SIZE, MAX_SIZE = 64, 2048
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo ready for fitting and reconstruction; S is the crop's size in pixels.
+
+    path as given; sha256 of the file. image [3,S,S] float32 sRGB in [0,1], the person on a plain background;
+    matte [S,S] float32 in [0,1], 1 = person (hair, face, neck, shoulders), 0 outside the photo;
+    landmarks [478,2] float32 in crop pixels (pixel centres at +0.5, may lie outside), mediapipe face mesh order;
+    crop (x0, y0, side) of the square in the upright photo, in its pixels;
+    original [3,S,S] float32, the crop with its own background.
+    """
+
+    path: str
+    sha256: str
+    image: Tensor
+    matte: Tensor
+    landmarks: Tensor
+    crop: Square
+    original: Tensor
+
+
+def prepare(path: str | Path, size: int = 512, background: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Photo:
+    """Read a photo, find its largest face, crop the head, matte it and put it on `background` (sRGB in [0,1]).
+
+    The crop is a square of 1.5 times the head's box, the head being the face extended over the hair; it may reach
+    outside the photo, where the matte is 0. A file with transparency around the person brings its own matte.
+    The same file gives the same result. Raises `PhotoError` when the file cannot be read or shows no face.
+    """
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise ValueError(f"size: must lie between {MIN_SIZE} and {MAX_SIZE} pixels, got {size}")
+    if len(background) != 3 or not all(0.0 <= level <= 1.0 for level in background):
+        raise ValueError(f"background: give three sRGB levels between 0 and 1, got {background}")
+    picture = read(path)
+    rgb = _opaque(picture, background)
+    face = find_face(rgb)
+    if face is None:
+        raise PhotoError(path, "shows no face that can be found; use an upright photo with the whole face in view")
+    square = _head_square(rgb, face)
+    landmarks = to_crop(face, square, size)
+    crop = resample(rgb, square, size)
+    alpha = _matte(crop, landmarks)
+    colours = matte.foreground(crop, alpha)
+    if picture.alpha is not None:
+        given = (resample(picture.alpha, square, size) / 255).astype(np.float32)
+        alpha, colours = _merge(alpha, given, colours, resample(picture.rgb, square, size))
+    inside = coverage(rgb.shape[:2], square, size)
+    alpha = alpha * inside
+    plain = np.array(background, dtype=np.float32)
+    return Photo(
+        path=picture.path,
+        sha256=picture.sha256,
+        image=_chw(plain + alpha[..., None] * (colours - plain)),
+        matte=torch.from_numpy(alpha),
+        landmarks=torch.from_numpy(landmarks.astype(np.float32)),
+        crop=square,
+        original=_chw(plain + inside[..., None] * (crop.astype(np.float32) / 255 - plain)),
+    )
+
+
+def _opaque(picture: Picture, background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """The picture [H,W,3] composited on the background where it is transparent."""
+    if picture.alpha is None:
+        return picture.rgb
+    share = picture.alpha[..., None] / np.float32(255)
+    plain = np.array(background, dtype=np.float32) * 255
+    return np.round(plain + share * (picture.rgb - plain)).astype(np.uint8)
+
+
+def _head_square(rgb: NDArray[np.uint8], face: NDArray[np.float64]) -> Square:
+    """Crop around the head: the face's box extended upwards, then widened to the hair that the segmentation shows."""
+    height = float(np.linalg.norm(face[FOREHEAD] - face[CHIN]))
+    low, high = face.min(axis=0), face.max(axis=0)
+    low, high = np.minimum(low, [low[0], high[1] - HEAD_TO_FACE * height]), high.copy()
+    reach = height * HAIR_LIMIT
+    side = float((high - low).max()) + 2 * reach
+    scan = (float((low + high)[0] - side) / 2, float((low + high)[1] - side) / 2, side)
+    person = person_mask(resample(rgb, scan, SCAN_SIDE)) * coverage(rgb.shape[:2], scan, SCAN_SIDE) > 0.5
+    x, y = (np.arange(SCAN_SIDE) + 0.5) * side / SCAN_SIDE + np.array(scan[:2])[:, None]
+    mouth_row = face[[61, 291], 1].mean()  # lower rows show shoulders
+    person &= (y < mouth_row)[:, None] & (np.abs(x - (low + high)[0] / 2) < (high - low)[0] / 2 + reach)[None]
+    rows, columns = np.nonzero(person)
+    if rows.size:
+        low = np.minimum(low, [x[columns.min()], max(y[rows.min()], low[1] - reach)])
+        high[0] = max(high[0], x[columns.max()])
+    side = CROP_TO_HEAD * float((high - low).max())
+    x0, y0 = (low + high - side) / 2
+    return float(x0), float(y0), side
+
+
+def _matte(crop: NDArray[np.uint8], landmarks: NDArray[np.float64]) -> NDArray[np.float32]:
+    size = crop.shape[0]
+    oval = landmarks[list(OVAL)]
+    sure = polygon(oval.mean(axis=0) + 0.85 * (oval - oval.mean(axis=0)), size)
+    return matte.solve(crop, matte.trimap(person_mask(crop), sure))
+
+
+def _merge(
+    alpha: NDArray[np.float32], given: NDArray[np.float32], colours: NDArray[np.float32], own: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Matte and colours when the file has an alpha channel: it is the matte if it cuts the background away.
+
+    An alpha channel that keeps the background (rounded corners, say) only takes away from the estimated matte.
+    """
+    behind = alpha < 0.5
+    if behind.any() and float(given[behind].mean()) < 0.5:
+        return given, (own / 255).astype(np.float32)
+    return alpha * given, colours
+
+
+def _chw(image: NDArray) -> Tensor:
+    return torch.from_numpy(image.astype(np.float32).clip(0, 1).transpose(2, 0, 1).copy())
