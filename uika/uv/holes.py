@@ -1,0 +1,41 @@
+"""Closing of pinholes between reprojected texels by normalised convolution."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+@torch.no_grad()
+def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, radius: int = 2) -> tuple[Tensor, Tensor]:
+    """Give texels at most `radius` texels (per axis) from a seen one the weighted average of their neighbours.
+
+    values [B,C,S,S], weight [B,1,S,S] (0 = unseen), valid [S,S] bool or None (texels that may be filled).
+    Returns (values, weight); seen texels are returned unchanged, a closed texel's weight is the mean weight of the
+    seen texels around it. Raises ValueError for a radius below 1.
+    """
+    if radius < 1:
+        raise ValueError(f"radius must be at least 1 texel, got {radius}")
+    channels = values.shape[1]
+    seen = weight > 0
+    sums = _blur(torch.cat([values * weight, weight, seen.to(values.dtype)], dim=1), radius)
+    total, neighbours = sums[:, channels : channels + 1], sums[:, channels + 1 :]
+    # Far from seen texels the separable blur is exactly 0, as every term of it is.
+    hole = ~seen & (total > 0)
+    if valid is not None:
+        hole &= valid
+    closed = sums[:, :channels] / torch.where(hole, total, torch.ones_like(total))
+    mean_weight = total / torch.where(hole, neighbours, torch.ones_like(neighbours))
+    return torch.where(hole, closed, values), torch.where(hole, mean_weight, weight)
+
+
+def _blur(maps: Tensor, radius: int) -> Tensor:
+    """Separable Gaussian of sigma radius/2 cut at `radius`, zeros outside the map."""
+    offsets = torch.arange(-radius, radius + 1, dtype=maps.dtype, device=maps.device)
+    kernel = torch.exp(-2 * (offsets / radius) ** 2)
+    kernel = kernel / kernel.sum()
+    flat = maps.flatten(0, 1)[:, None]
+    flat = functional.conv2d(flat, kernel[None, None, :, None], padding=(radius, 0))
+    flat = functional.conv2d(flat, kernel[None, None, None, :], padding=(0, radius))
+    return flat[:, 0].reshape(maps.shape)
