@@ -1,5 +1,7 @@
 """The parametric head: its model, parameters, posing, cameras, rasterizer, UV atlas and Gaussian binding."""
 
+from uika.head.atlas import Binding, uv_texels
+from uika.head.binding import pose_gaussians, skin_points, surface_frames, surface_points
 from uika.head.camera import Camera, look_at, orbit, project
 from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel, load_head, save_arrays, save_head
 from uika.head.parameters import HeadParameters
@@ -9,6 +11,7 @@ from uika.head.raster import rasterize
 __all__ = [
     "JOINT_NAMES",
     "JOINT_PARENTS",
+    "Binding",
     "Camera",
     "HeadError",
     "HeadModel",
@@ -17,6 +20,7 @@ __all__ = [
     "load_head",
     "look_at",
     "orbit",
+    "pose_gaussians",
     "pose_vertices",
     "project",
     "rasterize",
@@ -25,5 +29,9 @@ __all__ = [
     "save_arrays",
     "save_head",
     "shaped_vertices",
+    "skin_points",
+    "surface_frames",
+    "surface_points",
+    "uv_texels",
     "vertex_normals",
 ]
