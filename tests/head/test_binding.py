@@ -103,7 +103,7 @@ def test_degenerate_triangles_give_rotations_and_finite_gradients(head: HeadMode
     crushed[head.faces[50]] = crushed[head.faces[50, 0]].clone()
     frames, area = surface_frames(crushed, head.faces)
     torch.testing.assert_close(torch.linalg.det(frames), torch.ones(len(head.faces)))
-    assert float(area[50]) == 0
+    assert float(area[50]) < 1e-15
     gaussians, triangle, barycentric = gaussians_on(head)
     crushed.requires_grad_()
     posed = pose_gaussians(*gaussians, head.template, crushed, head.faces, triangle, barycentric)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag, normalize
+from torch.nn.functional import embedding_bag
 
 from uika.head.atlas import Binding
 from uika.head.model import HeadModel
 from uika.head.parameters import HeadParameters
 from uika.head.posing import joint_transforms
 
-_SMALL = 1e-20
+_SMALL = 1e-18
 _FLAT = 1e-6  # twice the area over the longest edge squared, below which a triangle counts as flat
 _SCALE_RANGE = (0.5, 2.0)
 
@@ -51,18 +51,8 @@ def surface_frames(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
         Rotations [...,F,3,3] with columns tangent (first edge), bitangent and normal, and areas [...,F] in square
         metres. A triangle without area gets a frame that is still a rotation.
     """
-    a, b, c = (vertices.index_select(-2, faces[:, corner]) for corner in range(3))
-    cross = torch.linalg.cross(b - a, c - a)
-    twice_area = cross.norm(dim=-1)
-    x_axis, z_axis = (vertices.new_tensor(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    longest = torch.maximum((b - a).square().sum(-1), (c - a).square().sum(-1))
-    sound = ((twice_area > _FLAT * longest) & (twice_area > _SMALL))[..., None]
-    tangent = normalize(torch.where(sound, b - a, x_axis), dim=-1, eps=_SMALL)
-    normal = torch.where(sound, cross, z_axis)
-    # Slivers lose the normal's digits: what is left of the tangent in it is taken out.
-    normal = normalize(normal, dim=-1, eps=_SMALL)
-    normal = normalize(normal - (normal * tangent).sum(-1, keepdim=True) * tangent, dim=-1)
-    return torch.stack((tangent, torch.linalg.cross(normal, tangent), normal), -1), twice_area / 2
+    frame, area = _frames(*_edges(vertices, faces))
+    return torch.stack(frame, -1).movedim(0, -2), area
 
 
 def pose_gaussians(
@@ -94,13 +84,19 @@ def pose_gaussians(
         Posed means [...,M,3], quats [...,M,4] and scales [...,M,3]; scales follow the square root of the surface's
         growth, limited to a factor between 0.5 and 2.
     """
-    corners = faces[triangle]
-    rotation, growth = _vertex_motion(canonical_vertices, posed_vertices, faces)
-    offset = means - _interpolate(canonical_vertices, corners, barycentric)
-    motion = _interpolate(torch.cat((posed_vertices, rotation, growth[..., None]), -1), corners, barycentric)
-    turn = normalize(motion[..., 3:7], dim=-1)
-    posed_means = motion[..., :3] + _rotate(turn, offset)
-    return posed_means, _multiply(turn, quats), scales * motion[..., 7:8]
+    corners = faces.index_select(0, triangle)
+    motion = torch.cat((posed_vertices, _vertex_motion(canonical_vertices, posed_vertices, faces)), -1)
+    moved = _components_first(_interpolate(motion, corners, barycentric))
+    lead = (1,) * (moved.ndim - 2)
+    offset = _components_first(means - _interpolate(canonical_vertices, corners, barycentric)).view(3, *lead, -1)
+    v, uvw = _components_first(quats).view(4, *lead, -1).split((1, 3))
+    w, xyz = (moved[3:7] * _dot(moved[3:7], moved[3:7]).clamp_min(_SMALL).rsqrt()).split((1, 3))
+    twice = 2 * _cross(xyz, offset)
+    posed_means = moved[:3] + offset + w * twice + _cross(xyz, twice)
+    real = w * v - _dot(xyz, uvw)
+    posed_quats = torch.cat((real, w * uvw + v * xyz + _cross(xyz, uvw)))
+    posed_scales = scales * moved[7, ..., None]
+    return posed_means.movedim(0, -1).contiguous(), posed_quats.movedim(0, -1).contiguous(), posed_scales
 
 
 def _interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
@@ -108,92 +104,115 @@ def _interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor
     # An embedding bag gathers and sums in one pass, several times faster than three gathers; frames ride as channels.
     table = values.movedim(-2, 0)
     mixed = embedding_bag(corners, table.reshape(len(table), -1), per_sample_weights=barycentric, mode="sum")
-    return mixed.view(-1, *table.shape[1:]).movedim(0, -2).contiguous()
+    return mixed.view(-1, *table.shape[1:]).movedim(0, -2)
 
 
-def _vertex_motion(canonical: Tensor, posed: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation [...,V,4] (wxyz) and scale [...,V] that carry the canonical surface to the posed one at each vertex."""
-    frames, area = surface_frames(canonical, faces)
-    posed_frames, posed_area = surface_frames(posed, faces)
-    twist = _in_plane_twist(canonical, posed, frames, posed_frames, faces)
-    quats = _matrix_to_quaternion(posed_frames @ twist @ frames.mT) * area[..., None]
+def _vertex_motion(canonical: Tensor, posed: Tensor, faces: Tensor) -> Tensor:
+    """Rotation (wxyz) and scale [...,V,5] that carry the canonical surface to the posed one at each vertex."""
+    moved = _edges(posed, faces)
+    first, second = (edge.view(3, *(1,) * (posed.ndim - 2), -1) for edge in _edges(canonical, faces))
+    rest = (first, second)
+    (tangent, bitangent, normal), area = _frames(*rest)
+    (posed_tangent, posed_bitangent, posed_normal), posed_area = _frames(*moved)
+    cosine, sine = _in_plane_twist(rest, tangent, bitangent, moved, posed_tangent, posed_bitangent)
+    turned_tangent = cosine * posed_tangent + sine * posed_bitangent
+    turned_bitangent = cosine * posed_bitangent - sine * posed_tangent
+    pairs = ((turned_tangent, tangent), (turned_bitangent, bitangent), (posed_normal, normal))
+    quats = _matrix_to_quaternion(sum(after[:, None] * before[None] for after, before in pairs)) * area  # type: ignore[arg-type]
     # A quaternion and its negative are one rotation: before adding, all are turned to the mesh's mean rotation,
     # the main eigenvector of the summed outer products (Markley et al., Averaging Quaternions, 2007).
     with torch.no_grad():
-        moment = (quats.mT @ quats).double()
-        mean = torch.linalg.eigh(moment).eigenvectors[..., -1].to(quats.dtype)
-        sign = torch.where((quats * mean[..., None, :]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    V = canonical.shape[-2]
-    parts = torch.cat((quats * sign, posed_area[..., None], area.expand_as(posed_area)[..., None]), -1)
-    total = parts.new_zeros(*parts.shape[:-2], V, 6)
+        rows = quats.movedim(0, -2).double()
+        mean = torch.linalg.eigh(rows @ rows.mT).eigenvectors[..., -1].to(quats.dtype)
+        sign = torch.where(_dot(quats, mean.movedim(-1, 0)[..., None]) < 0, -1.0, 1.0)
+    parts = torch.cat((quats * sign, posed_area[None], area.expand_as(posed_area)[None])).movedim(-1, 0).contiguous()
+    total = parts.new_zeros(canonical.shape[-2], *parts.shape[1:])
     for corner in range(3):
-        total = total.index_add(-2, faces[:, corner], parts)
-    rotation = normalize(total[..., :4], dim=-1, eps=_SMALL)
+        total = total.index_add(0, faces[:, corner], parts)
+    total = total.movedim(0, -1)
+    rotation = total[:4] * _dot(total[:4], total[:4]).clamp_min(_SMALL).rsqrt()
     # The floors keep a vertex without triangles still, and the square root's gradient finite.
-    growth = ((total[..., 4] + _SMALL) / (total[..., 5] + _SMALL)).sqrt().clamp(*_SCALE_RANGE)
-    return rotation, growth
+    growth = ((total[4] + _SMALL) / (total[5] + _SMALL)).sqrt().clamp(*_SCALE_RANGE)
+    return torch.cat((rotation, growth[None])).movedim(0, -1)
 
 
-def _in_plane_twist(canonical: Tensor, posed: Tensor, frames: Tensor, posed_frames: Tensor, faces: Tensor) -> Tensor:
-    """Rotation [...,F,3,3] about the normal that makes the triangle's turn independent of the order of its corners.
+def _edges(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """First and second edge [3,...,F] of each triangle, from its first corner; components first for speed."""
+    a, b, c = (vertices.movedim(-1, 0).index_select(-1, faces[:, corner]) for corner in range(3))
+    return b - a, c - a
+
+
+def _frames(first: Tensor, second: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Tangent, bitangent and normal [3,...,F] and area [...,F] from two edges."""
+    cross = _cross(first, second)
+    twice_area = _dot(cross, cross).clamp_min(_SMALL**2).sqrt()
+    longest = torch.maximum(_dot(first, first), _dot(second, second))
+    sound = (twice_area > _FLAT * longest) & (twice_area > _SMALL)
+    axes = torch.eye(3, dtype=first.dtype, device=first.device).view(3, 3, *(1,) * (first.ndim - 1))
+    tangent = _unit(torch.where(sound, first, axes[0]))
+    normal = _unit(torch.where(sound, cross, axes[2]))
+    # Slivers lose the normal's digits: what is left of the tangent in it is taken out.
+    normal = _unit(normal - _dot(normal, tangent) * tangent)
+    return (tangent, _cross(normal, tangent), normal), twice_area / 2
+
+
+def _in_plane_twist(
+    rest: tuple[Tensor, Tensor],
+    tangent: Tensor,
+    bitangent: Tensor,
+    moved: tuple[Tensor, Tensor],
+    posed_tangent: Tensor,
+    posed_bitangent: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Cosine and sine [...,F] of the turn about the normal that the first edges alone do not show.
 
     The frames follow the first edge; the polar part of the in-plane deformation says how far that edge's turn lies
-    from the triangle's mean turn.
+    from the triangle's mean turn, so that the result does not depend on the order of the corners.
     """
-
-    def flat(vertices: Tensor, frame: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        a, b, c = (vertices.index_select(-2, faces[:, corner]) for corner in range(3))
-        tangent, bitangent = frame[..., 0], frame[..., 1]
-        return ((b - a) * tangent).sum(-1), ((c - a) * tangent).sum(-1), ((c - a) * bitangent).sum(-1)
-
-    length, x, y = flat(canonical, frames)
-    posed_length, posed_x, posed_y = flat(posed, posed_frames)
+    length, x, y = _dot(rest[0], tangent), _dot(rest[1], tangent), _dot(rest[1], bitangent)
     sound = (length.abs() > _SMALL) & (y.abs() > _SMALL)
-    stretch = posed_length / torch.where(sound, length, 1.0)
     safe_y = torch.where(sound, y, 1.0)
-    shear = (posed_x - stretch * x) / safe_y
-    along = torch.where(sound, stretch + posed_y / safe_y, 1.0)
+    stretch = _dot(moved[0], posed_tangent) / torch.where(sound, length, 1.0)
+    shear = (_dot(moved[1], posed_tangent) - stretch * x) / safe_y
+    along = torch.where(sound, stretch + _dot(moved[1], posed_bitangent) / safe_y, 1.0)
     across = torch.where(sound, -shear, 0.0)
-    norm = (along.square() + across.square() + _SMALL).sqrt()
-    cosine, sine = along / norm, across / norm
-    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
-    return torch.stack((cosine, -sine, zero, sine, cosine, zero, zero, zero, one), -1).unflatten(-1, (3, 3))
+    scale = (along.square() + across.square() + _SMALL).rsqrt()
+    return along * scale, across * scale
 
 
 def _matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """Unit quaternions [...,4] (wxyz, any sign) of rotations [...,3,3]."""
-    xx, yy, zz = matrix.diagonal(dim1=-2, dim2=-1).unbind(-1)
-    rows = torch.stack(
-        (
-            torch.stack((1 + xx + yy + zz, _skew(matrix, 2, 1), _skew(matrix, 0, 2), _skew(matrix, 1, 0)), -1),
-            torch.stack((_skew(matrix, 2, 1), 1 + xx - yy - zz, _even(matrix, 0, 1), _even(matrix, 0, 2)), -1),
-            torch.stack((_skew(matrix, 0, 2), _even(matrix, 0, 1), 1 - xx + yy - zz, _even(matrix, 1, 2)), -1),
-            torch.stack((_skew(matrix, 1, 0), _even(matrix, 0, 2), _even(matrix, 1, 2), 1 - xx - yy + zz), -1),
-        ),
-        -2,
+    """Unit quaternions [4,...] (wxyz, any sign) of rotations [3,3,...]."""
+    xx, yy, zz = matrix[0, 0], matrix[1, 1], matrix[2, 2]
+    x, y, z = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
+    xy, xz, yz = matrix[0, 1] + matrix[1, 0], matrix[0, 2] + matrix[2, 0], matrix[1, 2] + matrix[2, 1]
+    squares = torch.stack((1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz))
+    rows = (
+        torch.stack((squares[0], x, y, z)),
+        torch.stack((x, squares[1], xy, xz)),
+        torch.stack((y, xy, squares[2], yz)),
+        torch.stack((z, xz, yz, squares[3])),
     )
     # Each row is the quaternion times four times one of its entries; the largest entry gives the exactest row.
-    best = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    chosen = rows.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
-    return normalize(chosen, dim=-1)
+    best = squares.argmax(0)
+    chosen = rows[3]
+    for index in range(3):
+        chosen = torch.where(best == index, rows[index], chosen)
+    return _unit(chosen)
 
 
-def _skew(matrix: Tensor, row: int, column: int) -> Tensor:
-    return matrix[..., row, column] - matrix[..., column, row]
+def _components_first(points: Tensor) -> Tensor:
+    return points.movedim(-1, 0).contiguous()
 
 
-def _even(matrix: Tensor, row: int, column: int) -> Tensor:
-    return matrix[..., row, column] + matrix[..., column, row]
+def _dot(one: Tensor, other: Tensor) -> Tensor:
+    return (one * other).sum(0)
 
 
-def _rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    vector = vector.expand_as(xyz)
-    twice = 2 * torch.linalg.cross(xyz, vector)
-    return vector + w * twice + torch.linalg.cross(xyz, twice)
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors * _dot(vectors, vectors).clamp_min(_SMALL**2).rsqrt()
 
 
-def _multiply(left: Tensor, right: Tensor) -> Tensor:
-    w, xyz, v, uvw = left[..., :1], left[..., 1:], right[..., :1], right[..., 1:]
-    real = w * v - (xyz * uvw).sum(-1, keepdim=True)
-    return torch.cat((real, w * uvw + v * xyz + torch.linalg.cross(xyz, uvw.expand_as(xyz))), -1)
+def _cross(one: Tensor, other: Tensor) -> Tensor:
+    a, b, c = one.unbind(0)
+    d, e, f = other.unbind(0)
+    return torch.stack((b * f - c * e, c * d - a * f, a * e - b * d))
