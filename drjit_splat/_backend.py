@@ -1,0 +1,102 @@
+"""The Dr.Jit backend that serves a torch device, and the few helpers every kernel uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import torch
+
+from .llvm import require
+
+TILE = 4  # pixels along each side of the tile that one SIMD lane renders
+PIXELS = TILE * TILE
+
+
+@dataclass(frozen=True)
+class Backend:
+    """Array types of one Dr.Jit backend; `ad` holds the differentiable twins of the plain ones."""
+
+    plain: Any
+    ad: Any
+    scatter_mode: dr.ReduceMode
+    is_cpu: bool
+
+
+@lru_cache(maxsize=2)
+def _cpu() -> Backend:
+    require()
+    import drjit.llvm as plain
+
+    return Backend(plain, plain.ad, dr.ReduceMode.Expand, True)
+
+
+@lru_cache(maxsize=2)
+def _cuda() -> Backend:
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        raise RuntimeError(
+            "the tensors are on a CUDA device, but Dr.Jit found no usable CUDA driver; move them to the CPU"
+        )
+    import drjit.cuda as plain
+
+    return Backend(plain, plain.ad, dr.ReduceMode.Auto, False)
+
+
+def backend_of(device: torch.device) -> Backend:
+    """Backend for tensors on `device`.
+
+    Raises:
+        RuntimeError: no LLVM >= 16 (CPU) or no CUDA driver could be loaded.
+        ValueError: the device is neither a CPU nor a CUDA device.
+    """
+    if device.type == "cpu":
+        return _cpu()
+    if device.type == "cuda":
+        return _cuda()
+    raise ValueError(f"tensors must be on the CPU or a CUDA device, not {device}")
+
+
+def smaller(a: Any, b: Any) -> Any:
+    """Lane-wise minimum by selection: LLVM 15 crashes on the vector intrinsic behind `dr.minimum`."""
+    return dr.select(a < b, a, b)
+
+
+def larger(a: Any, b: Any) -> Any:
+    """Lane-wise maximum by selection, see `smaller`."""
+    return dr.select(a > b, a, b)
+
+
+def flat(kind: Any, tensor: torch.Tensor) -> Any:
+    """Contiguous torch tensor -> flat Dr.Jit array on the same memory (float32, int32 or bool)."""
+    return kind(tensor.detach().contiguous().view(-1))
+
+
+def packet(be: Backend, source: Any, index: Any, size: int) -> list[Any]:
+    """The `size` (a power of two) consecutive values at `index * size` of a flat array, read as one packet."""
+    if size == 1:
+        return [dr.gather(be.plain.Float, source, index)]
+    values = dr.gather(be.plain.ArrayXf, source, index, shape=(size, dr.width(index)))
+    return [values[i] for i in range(size)]
+
+
+def write_packet(be: Backend, target: Any, values: list[Any], index: Any, active: Any = True) -> None:
+    """Write `values` (a power of two of them) to `index * len(values)` of a flat array as one packet."""
+    if len(values) == 1:
+        dr.scatter(target, values[0], index, active)
+    else:
+        dr.scatter(target, be.plain.ArrayXf(values), index, active)
+
+
+def add_packet(be: Backend, target: Any, values: list[Any], index: Any, active: Any = True) -> None:
+    """Add `values` (a power of two of them) to `index * len(values)` of a flat array, safely across threads."""
+    if len(values) == 1:
+        dr.scatter_add(target, values[0], index, active, mode=be.scatter_mode)
+    else:
+        dr.scatter_add(target, be.plain.ArrayXf(values), index, active, mode=be.scatter_mode)
+
+
+def power_of_two(n: int) -> int:
+    """Smallest power of two >= n."""
+    return 1 << max(0, n - 1).bit_length()

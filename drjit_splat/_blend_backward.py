@@ -1,0 +1,114 @@
+"""Adjoint of blending: replay each tile front to back and add up each splat's gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from . import constants as c
+from ._backend import TILE, Backend, add_packet, packet, power_of_two
+from ._blend import RECURRENCE_EPS2D, Blended, offsets, raw_alphas, read_features, tile_of
+from ._inputs import Settings
+from ._lists import TileLists
+
+MOMENTS = 8  # sums of v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v = alpha dL/dalpha, and 2 spare
+
+
+def blend_backward(
+    be: Backend,
+    records: Any,
+    lists: TileLists,
+    blended: Blended,
+    features: int,
+    grad_features: Any,  # [H * W * F]
+    grad_coverage: Any | None,  # [H * W]
+    moments: Any,  # [N * MOMENTS], added to
+    grad_values: Any,  # [N * power_of_two(F)], added to
+    settings: Settings,
+) -> None:
+    """Add the gradients of one chunk of features to `moments` and `grad_values`.
+
+    `behind` starts as the gradient-weighted sum of everything in the pixel and loses each splat as it is passed,
+    so that dL/dalpha needs neither a stored state nor a walk from the back:
+    alpha dL/dalpha = w (c . g) - behind * alpha / (1 - alpha).
+    """
+    J = be.plain
+    tile = tile_of(be, blended.order, lists, settings)
+    stop = dr.gather(J.UInt32, blended.end, tile.index)
+    recurrence = settings.eps2d >= RECURRENCE_EPS2D
+    padded = power_of_two(features)
+
+    gradients, behind, start = [], [], []
+    for index, inside in tile.pixels():
+        g = [dr.gather(J.Float, grad_features, index * features + f, inside) for f in range(features)]
+        rest = J.Float(0)
+        for f in range(features):
+            rest = dr.fma(g[f], dr.gather(J.Float, blended.features, index * features + f, inside), rest)
+        if grad_coverage is not None:
+            left = dr.gather(J.Float, blended.transmittance, index, inside)
+            rest = dr.fma(-left, dr.gather(J.Float, grad_coverage, index, inside), rest)
+        gradients.append(g)
+        behind.append(rest)
+        start.append(dr.select(inside, J.Float(1.0), J.Float(-1.0)))
+
+    def body(k: Any, transmittances: list[Any], behind: list[Any]) -> tuple[Any, list[Any], list[Any]]:
+        splat = dr.gather(J.UInt32, lists.ids, k)
+        geometry = packet(be, records, 2 * splat, 8)
+        values = read_features(be, records, splat, features)
+        dx, dy = offsets(be, tile, geometry)
+        alphas = raw_alphas(geometry, dx, dy, recurrence)
+        transmittances, behind = list(transmittances), list(behind)
+        by_value = [J.Float(0) for _ in range(features)]
+        total = J.Float(0)
+        slopes = []
+        for p, raw in enumerate(alphas):
+            clamped = raw >= c.ALPHA_MAX
+            alpha = dr.select(clamped, c.ALPHA_MAX, raw)
+            alpha = dr.select(raw < c.ALPHA_MIN, 0.0, alpha)
+            t = transmittances[p]
+            after = dr.fma(-alpha, t, t)
+            alive = after > c.T_MIN
+            weight = dr.select(alive, alpha * t, 0.0)
+            transmittances[p] = dr.select(alive, after, -dr.abs(t))
+            shade = J.Float(0)
+            for f, value in enumerate(values):
+                shade = dr.fma(value, gradients[p][f], shade)
+                by_value[f] = dr.fma(weight, gradients[p][f], by_value[f])
+            behind[p] = dr.fma(-weight, shade, behind[p])
+            slope = dr.fma(weight, shade, -behind[p] * alpha / (1.0 - alpha))
+            slopes.append(dr.select(alive & ~clamped, slope, 0.0))
+            total += weight
+        write = total > 0.0
+        add_packet(be, moments, _moments(J, slopes, dx, dy), splat, write)
+        add_packet(be, grad_values, by_value + [J.Float(0)] * (padded - features), splat, write)
+        return k + 1, transmittances, behind
+
+    dr.while_loop((tile.first, start, behind), lambda k, t, r: k < stop, body, mode="symbolic")
+
+
+def _moments(J: Any, slopes: list[Any], dx: Any, dy: Any) -> list[Any]:
+    """Moments about the splat's mean from those about the tile's first pixel (dx, dy away from the mean)."""
+    plain, by_x, by_xx = [], [], []
+    for row in range(TILE):
+        v = slopes[row * TILE : (row + 1) * TILE]
+        plain.append(v[0] + v[1] + v[2] + v[3])
+        by_x.append(v[1] + 2.0 * v[2] + 3.0 * v[3])
+        by_xx.append(v[1] + 4.0 * v[2] + 9.0 * v[3])
+    s = plain[0] + plain[1] + plain[2] + plain[3]
+    y = plain[1] + 2.0 * plain[2] + 3.0 * plain[3]
+    yy = plain[1] + 4.0 * plain[2] + 9.0 * plain[3]
+    x = by_x[0] + by_x[1] + by_x[2] + by_x[3]
+    xy = by_x[1] + 2.0 * by_x[2] + 3.0 * by_x[3]
+    xx = by_xx[0] + by_xx[1] + by_xx[2] + by_xx[3]
+    about_x, about_y = dr.fma(dx, s, x), dr.fma(dy, s, y)
+    return [
+        s,
+        about_x,
+        about_y,
+        dr.fma(dx, about_x + x, xx),
+        dr.fma(dx, about_y, dr.fma(dy, x, xy)),
+        dr.fma(dy, about_y + y, yy),
+        J.Float(0),
+        J.Float(0),
+    ]

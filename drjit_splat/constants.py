@@ -1,0 +1,37 @@
+"""Numbers that the kernels, their adjoints and the float64 oracle must share: a mismatch biases gradients silently."""
+
+from __future__ import annotations
+
+ALPHA_MIN = 1.0 / 255.0
+"""A (pixel, splat) pair below one 8-bit step is skipped; it also bounds each splat's footprint."""
+
+ALPHA_MAX = 0.999
+"""Opacity clamp: keeps 1 - alpha away from zero, which the backward pass divides by."""
+
+T_MIN = 1e-4
+"""Blending stops before the splat that would bring the transmittance to this value or below."""
+
+FRUSTUM_MARGIN = 0.3
+"""Share of tan(field of view / 2) beyond the image at which x/z and y/z are clamped inside the projection's
+Jacobian (1.3 tan in all); further out the affine approximation would smear one splat over the whole image."""
+
+QUAT_MIN_NORM = 1e-8
+"""Shorter quaternions have no usable direction: they stand for the identity rotation and get no gradient."""
+
+DET_MIN = 1e-12
+"""Smallest determinant (pixels^4) of a projected covariance that can be inverted in float32. With the default
+eps2d every determinant is >= 0.09, so this only culls splats when the low-pass is switched off."""
+
+COMPENSATION_MIN = 1e-10
+"""Floor of the determinant ratio under the antialiasing square root, whose slope is infinite at zero. At the floor
+an opacity is multiplied by 1e-5 and the splat is culled, so no visible splat is changed by it."""
+
+CUT_SLACK = 2e-3
+"""log2 units added to a splat's footprint threshold, so that rounding in the conservative tile test never drops a
+pixel that the exact per-pixel test would keep."""
+
+MAX_CHANNELS = 32
+"""Most colour channels of one call."""
+
+MAX_PAIRS = 2**31 - 1
+"""Most (tile, splat) pairs of one image: indices are 32 bit."""

@@ -1,0 +1,234 @@
+"""Float64 torch oracle of the rasterizer: the definition of the image, differentiable by autograd.
+
+It evaluates every (pixel, splat) pair, so keep scenes small (500 splats on 64x64 pixels take about a second). Nothing
+of the kernels is shared except `constants.py`, the argument checks and the spherical harmonics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import constants as c
+from ._harmonics import colors_seen_from
+from ._inputs import Settings, Splats, check_finite, check_shapes, finish
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """The discrete choices behind one camera's image; passing them back makes the image smooth in every input."""
+
+    order: Tensor  # [V] ids of the visible splats, near to far
+    keep: Tensor  # [V, H*W] bool: the pair is blended
+    clamped: Tensor  # [V, H*W] bool: opacity held at ALPHA_MAX
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What the camera makes of N splats."""
+
+    means2d: Tensor  # [N, 2] pixels
+    depths: Tensor  # [N] camera z
+    covariance: Tensor  # [N, 3] pixels^2: xx, xy, yy with the low-pass
+    determinant: Tensor  # [N]
+    opacities: Tensor  # [N] after the antialiasing factor
+    visible: Tensor  # [N] bool
+    radii: Tensor  # [N, 2] pixels, integer, zero where culled
+
+
+def quats_to_rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of wxyz quaternions [N, 4] of any length; too short ones give the identity."""
+    squared = (quats * quats).sum(-1, keepdim=True)
+    short = squared < c.QUAT_MIN_NORM**2
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
+    unit = torch.where(short, identity, quats / torch.where(short, torch.ones_like(squared), squared).sqrt())
+    w, x, y, z = unit.unbind(-1)
+    rows = (
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    )
+    return torch.stack(rows, -2)
+
+
+def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> Projection:
+    """EWA projection of all splats by one camera."""
+    s = settings
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    points = splats.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depths = points[:, 2]
+    in_range = (depths > s.near_plane) & (depths < s.far_plane)
+    z = torch.where(in_range, depths, torch.ones_like(depths))
+    slope = points[:, :2] / z[:, None]
+    means2d = torch.stack([fx * slope[:, 0] + cx, fy * slope[:, 1] + cy], -1)
+
+    clamped = []
+    for i, (focal, centre, size) in enumerate(((fx, cx, s.width), (fy, cy, s.height))):
+        margin = c.FRUSTUM_MARGIN * 0.5 * size / focal
+        clamped.append(
+            torch.minimum(torch.maximum(slope[:, i], -centre / focal - margin), (size - centre) / focal + margin)
+        )
+    rows = torch.stack(
+        [
+            (fx / z)[:, None] * (viewmat[0, :3] - clamped[0][:, None] * viewmat[2, :3]),
+            (fy / z)[:, None] * (viewmat[1, :3] - clamped[1][:, None] * viewmat[2, :3]),
+        ],
+        dim=1,
+    )
+    half = rows @ (quats_to_rotations(splats.quats) * splats.scales[:, None, :])
+    xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
+    # The determinant of half @ half^T as a sum of squared minors: xx * yy - xy^2 cancels for needles.
+    sharp = (torch.linalg.cross(half[:, 0], half[:, 1]) ** 2).sum(-1)
+    determinant = sharp + s.eps2d * (xx + yy) + s.eps2d**2
+    covariance = torch.stack([xx + s.eps2d, xy, yy + s.eps2d], -1)
+    invertible = determinant > c.DET_MIN
+    determinant = torch.where(invertible, determinant, torch.ones_like(determinant))
+    opacities = splats.opacities
+    if s.antialiased:
+        opacities = opacities * (sharp / determinant).clamp_min(c.COMPENSATION_MIN).sqrt()
+
+    bright = opacities.detach() >= c.ALPHA_MIN
+    reach2 = 2 * torch.log(opacities.detach().clamp_min(c.ALPHA_MIN) / c.ALPHA_MIN)
+    extent = (reach2[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
+    size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
+    on_screen = ((means2d + extent > 0.5) & (means2d - extent < size - 0.5)).all(-1)
+    visible = in_range & invertible & bright & on_screen & (extent.ceil() > s.radius_clip).any(-1)
+    radii = torch.where(visible[:, None], extent.ceil(), torch.zeros_like(extent)).to(torch.int32)
+    return Projection(means2d, depths, covariance, determinant, opacities, visible.detach(), radii)
+
+
+def _pixel_centres(settings: Settings, like: Tensor) -> tuple[Tensor, Tensor]:
+    ys, xs = torch.meshgrid(
+        torch.arange(settings.height, dtype=like.dtype, device=like.device) + 0.5,
+        torch.arange(settings.width, dtype=like.dtype, device=like.device) + 0.5,
+        indexing="ij",
+    )
+    return xs.reshape(1, -1), ys.reshape(1, -1)
+
+
+def blend(
+    projection: Projection, features: Tensor, settings: Settings, order: Tensor | None, decisions: Decisions | None
+) -> tuple[Tensor, Tensor, Decisions, Tensor]:
+    """Blend features [N, D] front to back.
+
+    Returns:
+        The sums [H, W, D], the coverage [H, W, 1], the decisions taken and, for each pixel [H, W], the relative
+        distance of its closest decision to its threshold.
+    """
+    p = projection
+    if decisions is not None:
+        order = decisions.order
+    else:
+        order = torch.argsort(p.depths.detach(), stable=True) if order is None else order
+        order = order[p.visible[order]]
+    xs, ys = _pixel_centres(settings, p.means2d)
+    dx, dy = xs - p.means2d[order, 0:1], ys - p.means2d[order, 1:2]
+    xx, xy, yy = (p.covariance[order, i : i + 1] for i in range(3))
+    sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / p.determinant[order, None]
+    raw = p.opacities[order, None] * torch.exp(-sigma)
+
+    clamped = raw.detach() > c.ALPHA_MAX if decisions is None else decisions.clamped
+    alpha = torch.where(clamped, torch.full_like(raw, c.ALPHA_MAX), raw)
+    hit = alpha.detach() >= c.ALPHA_MIN
+    if decisions is None:
+        after = torch.cumsum(torch.log1p(-alpha.detach() * hit), 0).exp()
+        keep = hit & (after > c.T_MIN)
+    else:
+        keep = decisions.keep
+    alpha = torch.where(keep, alpha, torch.zeros_like(alpha))
+    log_after = torch.cumsum(torch.log1p(-alpha), 0)
+    before = torch.cat([torch.zeros_like(log_after[:1]), log_after[:-1]]).exp()
+    sums = (alpha * before).T @ features[order]
+    coverage = -torch.expm1(log_after[-1:].T) if len(order) else torch.zeros_like(xs).T
+
+    margin = torch.full_like(xs[0], torch.inf)
+    if decisions is None and len(order):
+        reached = before.detach() > c.T_MIN
+        free = raw.detach()
+        near = torch.minimum((free / c.ALPHA_MIN - 1).abs(), (free / c.ALPHA_MAX - 1).abs())
+        near = torch.minimum(near, torch.where(hit, (after / c.T_MIN - 1).abs(), torch.full_like(after, torch.inf)))
+        margin = torch.where(reached, near, torch.full_like(near, torch.inf)).amin(0)
+    shape = (settings.height, settings.width)
+    taken = Decisions(order, keep, clamped)
+    return sums.reshape(*shape, -1), coverage.reshape(*shape, 1), taken, margin.reshape(shape)
+
+
+def rasterization(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, D] or [N, K, D]
+    viewmats: Tensor,  # [C, 4, 4]
+    Ks: Tensor,  # [C, 3, 3]
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,  # [C, D]
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    order: Tensor | None = None,
+    decisions: list[Decisions] | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render as `drjit_splat.rasterization` does, in float64.
+
+    Args:
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d,
+            sh_degree, backgrounds, render_mode, rasterize_mode: as in `drjit_splat.rasterization`.
+        order: [C, N] splat ids near to far; by default the float64 depths decide.
+        decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
+
+    Returns:
+        colors [C, H, W, D], alphas [C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii`, `visible` (as the
+        fast path), `decisions` (one per camera) and `margin` [C, H, W]: how close, relatively, the pixel's closest
+        threshold is; compare images and gradients only where it exceeds the rounding error of the tested code.
+
+    Raises:
+        ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
+    """
+    settings = Settings(
+        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, render_mode, rasterize_mode
+    )
+    given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
+    check_shapes(given, settings)
+    check_finite(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    splats = Splats(*(None if t is None else t.to(torch.float64) for t in vars(given).values()))  # type: ignore[arg-type]
+
+    images, coverages, metas = [], [], []
+    for i in range(len(viewmats)):
+        viewmat, K = splats.viewmats[i], splats.Ks[i]
+        projection = project(splats, viewmat, K, settings)
+        parts = []
+        if settings.has_colors and sh_degree is None:
+            parts.append(splats.colors)
+        elif settings.has_colors:
+            parts.append(colors_seen_from(splats.colors, splats.means, viewmat, int(sh_degree or 0)))
+        if settings.has_depth:
+            parts.append(projection.depths[:, None])
+        sums, coverage, taken, margin = blend(
+            projection,
+            torch.cat(parts, -1),
+            settings,
+            None if order is None else order[i],
+            None if decisions is None else decisions[i],
+        )
+        background = None if splats.backgrounds is None else splats.backgrounds[i]
+        images.append(finish(sums, coverage, background, settings))
+        coverages.append(coverage)
+        metas.append((projection, taken, margin))
+    meta = {
+        "means2d": torch.stack([p.means2d for p, _, _ in metas]),
+        "depths": torch.stack([p.depths for p, _, _ in metas]),
+        "radii": torch.stack([p.radii for p, _, _ in metas]),
+        "visible": torch.stack([p.visible for p, _, _ in metas]),
+        "decisions": [taken for _, taken, _ in metas],
+        "margin": torch.stack([margin for _, _, margin in metas]),
+    }
+    return torch.stack(images), torch.stack(coverages), meta
