@@ -85,7 +85,8 @@ def accumulate(
     if weights is not None:
         weight = weight * weights
     coords = uv.float() if grid == "centers" else uv.float().clamp(0, 1)
-    table = torch.cat([coords, images.float(), weight], dim=2)
+    # Colours are premultiplied so that samples between two pixels follow the trusted one.
+    table = torch.cat([coords, images.float() * weight, weight], dim=2)
     valid = torch.isfinite(table).all(dim=2) & (weight[:, :, 0] > 0)
     valid &= ((coords >= 0) & (coords <= 1)).all(dim=2)
     table = table.permute(0, 1, 3, 4, 2).reshape(-1, 6)
@@ -94,9 +95,7 @@ def accumulate(
     for pixel, sample in _samples(table, valid.reshape(-1, height, width), oversample):
         view = pixel // (height * width)
         cells = _cells(sample[:, :2], size, grid)
-        sample_weight = sample[:, 5:6].double() / oversample**2
-        ones = torch.full_like(sample_weight, 1 / oversample**2)
-        payload = torch.cat([sample[:, 2:5] * sample_weight, sample_weight, ones], dim=1)
+        payload = torch.cat([sample[:, 2:].double(), torch.ones_like(sample[:, :1])], dim=1) / oversample**2
         out.index_add_(0, view * size * size + cells, payload)
     maps = out.reshape(batch, views, size, size, 5).permute(0, 1, 4, 2, 3)
     return Sums(color=maps[:, :, :3], weight=maps[:, :, 3:4], samples=maps[:, :, 4:5])

@@ -1,0 +1,92 @@
+"""Against recorded outputs of the released network at reduced sizes (not part of the repository)."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from uika.model import PRESETS, BackboneConfig, Reconstructor
+from uika.model.backbone import VisionTransformer
+from uika.model.fusion import Encoder
+from uika.model.mm_block import MMBlock
+
+PARITY = Path(__file__).parents[3] / "shared" / "parity"
+
+pytestmark = pytest.mark.skipif(not PARITY.exists(), reason="skipped: no recorded outputs beside the checkout")
+
+TOLERANCE = {"rtol": 0.0, "atol": 5e-5}
+# Weights of the released model that no output depends on.
+UNREAD = ("mask_token", "add_q_proj", "norm_added_q")
+
+
+def load(name: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """(weights, inputs and outputs)."""
+    data = load_file(PARITY / f"{name}.safetensors")
+    weights = {key[2:]: value for key, value in data.items() if key.startswith("w/")}
+    return weights, data
+
+
+def fit(module: nn.Module, weights: dict[str, Tensor]) -> None:
+    outcome = module.load_state_dict(weights, strict=False)
+    assert outcome.missing_keys == []
+    assert [key for key in outcome.unexpected_keys if not any(part in key for part in UNREAD)] == []
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_dual_attention_block(last: bool) -> None:
+    weights, data = load("mm_block_last" if last else "mm_block")
+    block = MMBlock(64, 4, last=last)
+    fit(block, weights)
+    with torch.no_grad():
+        x, cond, cond2 = block(data["in/x"], data["in/cond"], data["in/cond2"])
+    torch.testing.assert_close(x, data["out/x"], **TOLERANCE)
+    if not last:
+        assert cond2 is not None
+        torch.testing.assert_close(cond, data["out/cond"], **TOLERANCE)
+        torch.testing.assert_close(cond2, data["out/cond2"], **TOLERANCE)
+
+
+def test_backbone() -> None:
+    weights, data = load("dinov3_tiny")
+    model = VisionTransformer(BackboneConfig(dim=32, depth=3, heads=2, taps=(0, 2)))
+    fit(model, weights)
+    sin, cos = model.rope_embed(3, 5)
+    torch.testing.assert_close(sin, data["out/rope_sin"], **TOLERANCE)
+    torch.testing.assert_close(cos, data["out/rope_cos"], **TOLERANCE)
+    with torch.no_grad():
+        maps = model(data["in/x"])
+    for features, name in zip(maps, ("layer0", "layer2"), strict=True):
+        torch.testing.assert_close(features.flatten(2).transpose(1, 2), data[f"out/{name}"], **TOLERANCE)
+
+
+def test_encoder_and_its_fusion_heads() -> None:
+    weights, data = load("dino_fusion_wrapper")
+    backbone = BackboneConfig(dim=32, depth=24, heads=2, taps=(4, 11, 17, 23))
+    encoder = Encoder(dataclasses.replace(PRESETS["paper"], backbone=backbone, dim=40, heads=2))
+    fit(encoder, weights)
+    maps = tuple(data[f"in/feats.{index}"].transpose(1, 2).unflatten(2, (3, 4)) for index in range(4))
+    image = data["in/image"][:, None]
+    assert encoder.uv_fusion_head is not None
+    with torch.no_grad():
+        torch.testing.assert_close(encoder.fusion_head(maps), data["out/head_from_feats"], **TOLERANCE)
+        torch.testing.assert_close(encoder.uv_fusion_head(maps), data["out/uv_head_from_feats"], **TOLERANCE)
+        torch.testing.assert_close(encoder.screen(image), data["out/screen"], **TOLERANCE)
+        torch.testing.assert_close(encoder.uv(image), data["out/uv"], **TOLERANCE)
+
+
+def test_paper_preset_has_the_released_names_and_shapes() -> None:
+    recorded = json.loads((PARITY / "state_dict_uika.json").read_text())["state_dict"]
+    released = {
+        name: entry["shape"]
+        for name, entry in recorded.items()
+        if name.startswith(("encoder.", "transformer.", "gs_decoder."))
+        and "mask_token" not in name
+        and not (name.startswith("transformer.layers.11.") and any(part in name for part in UNREAD))
+    }
+    with torch.device("meta"):
+        model = Reconstructor(PRESETS["paper"])
+    assert {name: list(value.shape) for name, value in model.state_dict().items()} == released

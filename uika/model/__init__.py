@@ -1,0 +1,23 @@
+"""The reconstruction network: photos and their UV correspondence in, canonical Gaussians out."""
+
+from uika.model.checkpoint import CheckpointError, build, load_checkpoint, save_checkpoint
+from uika.model.config import PRESETS, BackboneConfig, GaussianConfig, ModelConfig, UvConfig
+from uika.model.gaussians import CanonicalGaussians, SurfaceTexels, multiply_quaternions
+from uika.model.reconstructor import Observation, Reconstructor
+
+__all__ = [
+    "PRESETS",
+    "BackboneConfig",
+    "CanonicalGaussians",
+    "CheckpointError",
+    "GaussianConfig",
+    "ModelConfig",
+    "Observation",
+    "Reconstructor",
+    "SurfaceTexels",
+    "UvConfig",
+    "build",
+    "load_checkpoint",
+    "multiply_quaternions",
+    "save_checkpoint",
+]

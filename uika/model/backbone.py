@@ -1,0 +1,175 @@
+"""Vision transformer with 2-D rotary positions, the feature extractor of photos and reprojected views.
+
+Layer for layer the architecture of DINOv3, with its parameter names, so that one class serves a small backbone trained
+from scratch and a pretrained one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uika.model.config import BackboneConfig
+
+_ROPE_BASE = 100.0
+_NORM_EPS = 1e-5
+
+
+class RotaryPositions(nn.Module):
+    """Sines and cosines of patch positions; coordinates run from -1 to 1 along each axis."""
+
+    periods: Tensor
+
+    def __init__(self, head_dim: int) -> None:
+        """`head_dim` must be a multiple of 4: a quarter of it per axis and phase."""
+        super().__init__()
+        quarter = head_dim // 4
+        self.register_buffer("periods", _ROPE_BASE ** (torch.arange(quarter, dtype=torch.float32) / quarter))
+
+    def forward(self, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+        """(sin, cos), each [rows*columns, head_dim]."""
+        axes = [2 * (torch.arange(n, device=self.periods.device) + 0.5) / n - 1 for n in (rows, columns)]
+        coords = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 2)
+        angles = (2 * math.pi * coords[:, :, None] / self.periods).flatten(1)
+        angles = angles.repeat(1, 2)
+        return angles.sin(), angles.cos()
+
+
+class MaskedBiasLinear(nn.Linear):
+    """The fused q,k,v projection; the bias of the keys is switched off."""
+
+    bias_mask: Tensor
+
+    def __init__(self, dim: int) -> None:
+        """`dim` -> 3*dim."""
+        super().__init__(dim, 3 * dim)
+        self.register_buffer("bias_mask", torch.cat([torch.ones(dim), torch.zeros(dim), torch.ones(dim)]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[...,dim] -> [...,3*dim]."""
+        return functional.linear(x, self.weight, self.bias * self.bias_mask)
+
+
+class Attention(nn.Module):
+    """Self attention; rotary positions turn the last tokens (the patches) only."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        """`heads` of dim/heads channels."""
+        super().__init__()
+        self.heads = heads
+        self.qkv = MaskedBiasLinear(dim)
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+        """x [N,L,C] with rope (sin, cos) of its last patches."""
+        count, length, dim = x.shape
+        query, key, value = self.qkv(x).reshape(count, length, 3, self.heads, dim // self.heads).unbind(2)
+        query, key = (_rotate(part.transpose(1, 2), rope) for part in (query, key))
+        out = functional.scaled_dot_product_attention(query, key, value.transpose(1, 2))
+        return self.proj(out.transpose(1, 2).reshape(count, length, dim))
+
+
+def _rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+    sin, cos = rope
+    prefix, patches = x[:, :, : -sin.shape[0]], x[:, :, -sin.shape[0] :]
+    first, second = patches.chunk(2, dim=-1)
+    turned = patches * cos.to(x.dtype) + torch.cat([-second, first], dim=-1) * sin.to(x.dtype)
+    return torch.cat([prefix, turned], dim=2)
+
+
+class LayerScale(nn.Module):
+    """Learned gain per channel."""
+
+    def __init__(self, dim: int, value: float) -> None:
+        """All gains start at `value`."""
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((dim,), value))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[...,dim]."""
+        return x * self.gamma
+
+
+class Mlp(nn.Module):
+    """Two layers with exact GELU, four times as wide inside."""
+
+    def __init__(self, dim: int) -> None:
+        """`dim` -> 4*dim -> `dim`."""
+        super().__init__()
+        self.fc1 = nn.Linear(dim, 4 * dim)
+        self.fc2 = nn.Linear(4 * dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[...,dim]."""
+        return self.fc2(functional.gelu(self.fc1(x)))
+
+
+class Block(nn.Module):
+    """Pre-norm attention and MLP, each behind a layer scale."""
+
+    def __init__(self, dim: int, heads: int, layer_scale: float) -> None:
+        """See `BackboneConfig`."""
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=_NORM_EPS)
+        self.attn = Attention(dim, heads)
+        self.ls1 = LayerScale(dim, layer_scale)
+        self.norm2 = nn.LayerNorm(dim, eps=_NORM_EPS)
+        self.mlp = Mlp(dim)
+        self.ls2 = LayerScale(dim, layer_scale)
+
+    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+        """x [N,L,C]."""
+        x = x + self.ls1(self.attn(self.norm1(x), rope))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class PatchEmbed(nn.Module):
+    """Patches to tokens."""
+
+    def __init__(self, dim: int, patch_size: int) -> None:
+        """One token of `dim` channels per patch."""
+        super().__init__()
+        self.proj = nn.Conv2d(3, dim, patch_size, stride=patch_size)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """[N,3,H,W] -> [N,C,H/p,W/p]."""
+        return self.proj(images)
+
+
+class VisionTransformer(nn.Module):
+    """Patch features at several depths."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        """Random initialisation; `config.frozen` switches gradients off."""
+        super().__init__()
+        self.taps = config.taps
+        self.patch_size = config.patch_size
+        self.cls_token = nn.Parameter(0.02 * torch.randn(1, 1, config.dim))
+        self.storage_tokens = nn.Parameter(0.02 * torch.randn(1, config.storage_tokens, config.dim))
+        self.patch_embed = PatchEmbed(config.dim, config.patch_size)
+        self.rope_embed = RotaryPositions(config.dim // config.heads)
+        self.blocks = nn.ModuleList(Block(config.dim, config.heads, config.layer_scale) for _ in range(config.depth))
+        self.norm = nn.LayerNorm(config.dim, eps=_NORM_EPS)
+        if config.frozen:
+            self.requires_grad_(False)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Normalised images [N,3,H,W], sides multiples of the patch size -> one [N,C,H/p,W/p] map per tap.
+
+        Every tap passes the final LayerNorm; class and storage tokens are dropped.
+        """
+        patches = self.patch_embed(images)
+        rows, columns = patches.shape[-2:]
+        prefix = torch.cat([self.cls_token, self.storage_tokens], dim=1).expand(len(images), -1, -1)
+        tokens = torch.cat([prefix, patches.flatten(2).transpose(1, 2)], dim=1)
+        rope = self.rope_embed(rows, columns)
+        maps = []
+        for index, block in enumerate(self.blocks[: max(self.taps) + 1]):
+            tokens = block(tokens, rope)
+            if index in self.taps:
+                features = self.norm(tokens)[:, prefix.shape[1] :]
+                maps.append(features.transpose(1, 2).unflatten(2, (rows, columns)))
+        return tuple(maps)

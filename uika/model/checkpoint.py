@@ -1,0 +1,131 @@
+"""Model files: safetensors with the configuration in the header, never a pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from uika.model.config import PRESETS, ModelConfig
+from uika.model.reconstructor import Reconstructor
+
+FORMAT = "uika-model"
+VERSION = "1"
+_LISTED = 8
+
+
+class CheckpointError(ValueError):
+    """A model file that cannot be used; the message names the file and what is wrong with it."""
+
+
+def build(preset: str | ModelConfig, seed: int = 0) -> Reconstructor:
+    """An untrained model, the same for the same seed; leaves the global generator as it was.
+
+    `preset` is a name from `PRESETS` or a config. Raises ValueError for an unknown name.
+    """
+    if isinstance(preset, str):
+        if preset not in PRESETS:
+            raise ValueError(f"unknown preset {preset!r}: choose from {', '.join(PRESETS)}")
+        preset = PRESETS[preset]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Reconstructor(preset)
+
+
+def save_checkpoint(
+    path: str | Path,
+    model: Reconstructor,
+    dtype: torch.dtype | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> None:
+    """Write weights and config; the file appears under its name only when it is complete.
+
+    `dtype` (for example torch.bfloat16) converts the weights on the way; `provenance` is kept in the header.
+    """
+    path = Path(path)
+    weights = dict(model.named_parameters())
+    tensors = {}
+    for name, value in model.state_dict().items():
+        # Buffers hold rotary periods, whose angles suffer from rounding.
+        value = value.to(dtype) if dtype is not None and name in weights else value
+        tensors[name] = value.detach().cpu().contiguous()
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "config": json.dumps(model.config.to_dict()),
+        "provenance": json.dumps(dict(provenance or {})),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    try:
+        save_file(tensors, temporary, metadata=metadata)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def load_checkpoint(path: str | Path) -> Reconstructor:
+    """Read a model written by `save_checkpoint`; weights are float32 on the CPU, the model is in eval mode.
+
+    Raises CheckpointError for a file that is missing, truncated, of another format or version, or whose tensors do
+    not fit its config.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such model file")
+    config, tensors = _read(path)
+    with torch.device("meta"):
+        model = Reconstructor(config)
+    expected = model.state_dict()
+    problems = [
+        _listing("missing", [name for name in expected if name not in tensors]),
+        _listing("unexpected", [name for name in tensors if name not in expected]),
+        _listing(
+            "wrong shape",
+            [
+                f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
+                for name, value in expected.items()
+                if name in tensors and tensors[name].shape != value.shape
+            ],
+        ),
+    ]
+    if any(problems):
+        raise CheckpointError(f"{path}: tensors do not fit the config: {'; '.join(filter(None, problems))}")
+    model.load_state_dict(tensors, assign=True)
+    return model.eval()
+
+
+def _read(path: Path) -> tuple[ModelConfig, dict[str, Tensor]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise CheckpointError(f"{path}: not a {FORMAT} file (format {metadata.get('format', 'unknown')!r})")
+            if metadata.get("version") != VERSION:
+                raise CheckpointError(
+                    f"{path}: version {metadata.get('version', 'unknown')} of the format, this program reads {VERSION}"
+                )
+            config = ModelConfig.from_dict(json.loads(metadata["config"]))
+            return config, {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise CheckpointError(f"{path}: damaged or truncated safetensors file ({error})") from error
+    except CheckpointError:
+        raise
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(f"{path}: unreadable config in the header ({error})") from error
+
+
+def _listing(kind: str, names: list[str]) -> str:
+    if not names:
+        return ""
+    rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"{kind}: {', '.join(names[:_LISTED])}{rest}"

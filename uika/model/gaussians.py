@@ -1,0 +1,63 @@
+"""What the model is given about the head surface, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SurfaceTexels:
+    """The canonical head surface at the M valid texels of the atlas; B is the batch size or 1.
+
+    points  [B,M,3] metres
+    quats   [B,M,4] wxyz rotation of the surface frame, local z along the outward normal
+    scales  [B,M,3] metres: standard deviations that close the surface, two tangent sizes and a thin normal one
+    mirror  [S,S] int64 row-major index of each texel's counterpart on the other half of the face, -1 where there is
+            none; None if unknown
+    """
+
+    points: Tensor
+    quats: Tensor
+    scales: Tensor
+    mirror: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class CanonicalGaussians:
+    """One Gaussian per valid texel, in the order of `texel`, in the canonical space of the surface.
+
+    means [B,M,3] metres, quats [B,M,4] wxyz unit, scales [B,M,3] metres, opacities [B,M], colors [B,M,3] in [0,1],
+    offsets [B,M,3] metres (means minus surface points), fusion_weight [B,M] share of the predicted colour,
+    aggregate [B,3,S,S] and confidence [B,1,S,S] the UV observation the colours start from,
+    report: counts of what was skipped or filled (see `Reconstructor.forward`).
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    offsets: Tensor
+    fusion_weight: Tensor
+    aggregate: Tensor
+    confidence: Tensor
+    report: Mapping[str, int]
+
+
+def multiply_quaternions(first: Tensor, second: Tensor) -> Tensor:
+    """Hamilton product of wxyz quaternions [...,4]: rotate by `second`, then by `first`."""
+    w1, x1, y1, z1 = first.unbind(-1)
+    w2, x2, y2, z2 = second.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )

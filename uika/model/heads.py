@@ -1,0 +1,106 @@
+"""Per-texel MLP and one linear layer per Gaussian attribute (paper section 3.3 and table S1)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uika.model.config import ModelConfig
+from uika.model.gaussians import SurfaceTexels, multiply_quaternions
+
+# Keeps exp and its gradient finite whatever the network says; far above any scale that survives the clip.
+_MAX_LOG_SCALE = 15.0
+
+
+class Attributes(NamedTuple):
+    """Gaussian attributes at M texels; shapes as in `CanonicalGaussians`."""
+
+    offsets: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    fusion_weight: Tensor
+
+
+class TexelMlp(nn.Module):
+    """Three layers with SiLU between them."""
+
+    def __init__(self, features: int, width: int) -> None:
+        """`features` -> `width`."""
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B,M,C] -> [B,M,W]."""
+        return self.layers(x)
+
+
+class AttributeHeads(nn.Module):
+    """Linear layers `out_layers.{xyz,opacity,scaling,rotation,shs}`, all starting from the values in the config.
+
+    Their weights start at zero, so every texel of the untrained model has the same attributes: offset exactly 0,
+    rotation the identity, scale exp(init_scale), opacity init_opacity.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        """See `GaussianConfig` for ranges and initial values."""
+        super().__init__()
+        self.config = config.gaussians
+        self.fusion = config.fusion
+        self.aggregation = config.aggregation
+        width = config.mlp_width
+        sizes = {"xyz": 3, "opacity": 1, "scaling": 3, "rotation": 4}
+        layers = {name: nn.Linear(width, size) for name, size in sizes.items()}
+        layers["shs"] = nn.Linear(width + (4 if config.aggregation else 0), 4 if self._learned else 3)
+        self.out_layers = nn.ModuleDict(layers)
+        self._initialise()
+
+    @property
+    def _learned(self) -> bool:
+        return self.aggregation and self.fusion == "learned"
+
+    def _initialise(self) -> None:
+        start = self.config
+        biases = {
+            "xyz": [0.0] * 3,
+            "opacity": [math.log(start.init_opacity / (1 - start.init_opacity))],
+            "scaling": [start.init_scale] * 3,
+            "rotation": [1.0, 0.0, 0.0, 0.0],
+        }
+        if start.fusion_bias is not None:
+            biases["shs"] = [0.0] * 3 + ([start.fusion_bias] if self._learned else [])
+        with torch.no_grad():
+            for name, bias in biases.items():
+                layer = cast(nn.Linear, self.out_layers[name])
+                nn.init.zeros_(layer.weight)
+                layer.bias.copy_(torch.tensor(bias))
+
+    def forward(self, features: Tensor, observed: Tensor, surface: SurfaceTexels) -> Attributes:
+        """features [B,M,W], observed [B,M,4] (aggregate colour and confidence at the texels)."""
+        out = self.out_layers
+        offsets = (torch.sigmoid(out["xyz"](features)) - 0.5) * 2 * self.config.offset_range
+        opacities = torch.sigmoid(out["opacity"](features))[..., 0]
+        scales = out["scaling"](features).clamp_max(_MAX_LOG_SCALE).exp()
+        quats = functional.normalize(out["rotation"](features), dim=-1)
+        if self.config.relative:
+            scales = scales * surface.scales
+            quats = multiply_quaternions(surface.quats.expand_as(quats), quats)
+        colors, weight = self._color(features, observed)
+        return Attributes(offsets, quats, scales.clamp(0, self.config.scale_clip), opacities, colors, weight)
+
+    def _color(self, features: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
+        """Self-adaptive fusion (paper eq. 9): predicted colour with share w, observed colour with share 1-w."""
+        layer = self.out_layers["shs"]
+        if not self.aggregation:
+            predicted = torch.sigmoid(layer(features))
+            return predicted, torch.ones_like(predicted[..., 0])
+        values = torch.sigmoid(layer(torch.cat([features, observed], dim=-1)))
+        weight = values[..., 3:] if self.fusion == "learned" else 0.5 * observed[..., 3:]
+        return weight * values[..., :3] + (1 - weight) * observed[..., :3], weight[..., 0]

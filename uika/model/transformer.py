@@ -1,0 +1,56 @@
+"""Learnable UV tokens through a stack of dual attention blocks (paper section 3.2, figure 2b)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from uika.model.config import ModelConfig
+from uika.model.mm_block import MMBlock
+
+_NORM_EPS = 1e-6
+_POSITION_BASE = 10000.0
+
+
+def sincos_positions(grid: int, dim: int) -> Tensor:
+    """[grid*grid, dim] in row-major order; first half of the channels from the column, second from the row."""
+    quarter = dim // 4
+    frequencies = _POSITION_BASE ** (-torch.arange(quarter, dtype=torch.float64) / quarter)
+    angles = torch.arange(grid, dtype=torch.float64)[:, None] * frequencies
+    line = torch.cat([angles.sin(), angles.cos()], dim=1)
+    columns = line[None].expand(grid, grid, -1)
+    rows = line[:, None].expand(grid, grid, -1)
+    return torch.cat([columns, rows], dim=-1).reshape(grid * grid, dim).float()
+
+
+class MMTransformer(nn.Module):
+    """UV tokens that read the features of any number of views."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        """Sizes from `config`; views carry no index, so their order has no effect."""
+        super().__init__()
+        tokens = config.token_grid**2
+        self.outputs = config.outputs
+        self.uv_token = nn.Parameter(torch.empty(tokens, config.dim))
+        nn.init.trunc_normal_(self.uv_token, std=0.02)
+        self.uv_pos_embed = nn.Parameter(sincos_positions(config.token_grid, config.dim))
+        self.linear_cond_proj = nn.Linear(config.dim, config.dim)
+        self.linear_cond_proj2 = nn.Linear(config.dim, config.dim) if config.uv_attention else None
+        self.layers = nn.ModuleList(
+            MMBlock(config.dim, config.heads, dual=config.uv_attention, last=index == config.layers - 1)
+            for index in range(config.layers)
+        )
+        self.norm_list = nn.ModuleList(nn.LayerNorm(config.dim, eps=_NORM_EPS) for _ in config.outputs)
+
+    def forward(self, screen: Tensor, uv: Tensor | None) -> list[Tensor]:
+        """Screen and UV features [B,V*L,D] -> the tokens [B,token_grid^2,D] at each output depth, normalised."""
+        tokens = (self.uv_token + self.uv_pos_embed).expand(screen.shape[0], -1, -1)
+        cond = self.linear_cond_proj(screen)
+        cond2 = None if self.linear_cond_proj2 is None or uv is None else self.linear_cond_proj2(uv)
+        results = []
+        for depth, layer in enumerate(self.layers, start=1):
+            tokens, cond, cond2 = layer(tokens, cond, cond2)
+            results += [
+                norm(tokens) for norm, output in zip(self.norm_list, self.outputs, strict=True) if output == depth
+            ]
+        return results
