@@ -36,6 +36,12 @@ def coverage(photo_size: tuple[int, int], square: Square, size: int) -> NDArray[
     return np.outer(inside(y0, height), inside(x0, width)).astype(np.float32)
 
 
+def pixel_centres(size: int) -> NDArray[np.float64]:
+    """Coordinates [size,size,2] of the pixel centres of a square crop."""
+    centres = np.arange(size) + 0.5
+    return np.stack(np.meshgrid(centres, centres), axis=-1)
+
+
 def to_crop(points: NDArray[np.float64], square: Square, size: int) -> NDArray[np.float64]:
     """Photo pixel coordinates [...,2] to crop pixel coordinates."""
     return (points - np.array(square[:2])) * (size / square[2])

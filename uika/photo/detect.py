@@ -9,20 +9,27 @@ from uika.photo.crop import Square, resample, to_photo
 from uika.photo.nets import face_boxes, face_meshes
 
 SCAN_SIDE = 640  # the detectors shrink their input to 192 or 128 px, so more would be lost
+LARGE_SIDE = 4 * SCAN_SIDE  # the smallest tiles need no more than this of the photo
 MESH_SIDE = 512
 FACE_MARGIN = 2.0  # side of the crop given to the face mesh, in face sizes
 # Crops of the second pass: (scale, shift x, shift y) relative to the margin above. Their mean is steadier than any one.
 PASSES = ((1.0, 0.0, 0.0), (0.85, 0.03, 0.0), (1.2, -0.03, 0.03))
+# Root mean square disagreement of those crops, in face sizes, above which it is no face: photographed faces stay below
+# 0.014, the wheels and dials that the detector takes for faces lie at 0.06 and more.
+MAX_SPREAD = 0.03
 
 
 def find_face(photo: NDArray[np.uint8]) -> NDArray[np.float64] | None:
     """Landmarks [478,2] (mediapipe face mesh order, photo pixels, centres at +0.5) of the largest face, or None.
 
     Looks at the whole photo first, then, when nothing is found, at the photo with a border (close-ups), then at
-    overlapping tiles of a half and a quarter of the photo (small faces).
+    overlapping tiles of a half and a quarter of the photo (small faces). A detection counts when
+    several crops of it agree.
     """
-    for squares in _searches(*photo.shape[:2]):
-        for face in _faces(photo, squares):
+    shrink = max(1.0, max(photo.shape[:2]) / LARGE_SIDE)
+    overview = _shrunk(photo, shrink)
+    for squares in _searches(*overview.shape[:2]):
+        for face in _faces(overview, squares, shrink):
             landmarks = _refine(photo, face)
             if landmarks is not None:
                 return landmarks
@@ -43,14 +50,24 @@ def _searches(height: int, width: int) -> list[list[Square]]:
     return rounds
 
 
-def _faces(photo: NDArray[np.uint8], squares: list[Square]) -> list[Square]:
-    """Squares around the detected faces, largest face first."""
-    scans = [resample(photo, square, SCAN_SIDE) for square in squares]
+def _shrunk(photo: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    if factor == 1.0:
+        return photo
+    height, width = photo.shape[:2]
+    size = (max(1, round(width / factor)), max(1, round(height / factor)))
+    return np.asarray(Image.fromarray(photo).resize(size, Image.Resampling.BOX))
+
+
+def _faces(overview: NDArray[np.uint8], squares: list[Square], shrink: float) -> list[Square]:
+    """Squares in the photo around the faces detected in its `shrink` times smaller overview, largest first."""
+    scans = [resample(overview, square, SCAN_SIDE) for square in squares]
     faces = []
     for square, boxes in zip(squares, face_boxes(scans), strict=True):
         for x, y, width, height in boxes:
             centre = to_photo(np.array([x + width / 2, y + height / 2]), square, SCAN_SIDE)
-            faces.append(_square(centre, max(width, height) * square[2] / SCAN_SIDE))
+            faces.append(_square(centre * shrink, max(width, height) * square[2] / SCAN_SIDE * shrink))
     return sorted(faces, key=lambda face: -face[2])
 
 
@@ -63,8 +80,12 @@ def _refine(photo: NDArray[np.uint8], face: Square) -> NDArray[np.float64] | Non
     low, high = first.min(axis=0), first.max(axis=0)
     side = FACE_MARGIN * float((high - low).max())
     squares = [_square((low + high) / 2 + side * np.array([dx, dy]), side * scale) for scale, dx, dy in PASSES]
-    found = [mesh for mesh in _meshes(photo, squares) if mesh is not None]
-    return np.mean(found, axis=0) if found else None
+    found = np.array([mesh for mesh in _meshes(photo, squares) if mesh is not None])
+    if len(found) < 2:
+        return None
+    mean = found.mean(axis=0)
+    spread = np.sqrt(np.square(found - mean).sum(axis=-1).mean()) / np.ptp(mean, axis=0).max()
+    return mean if spread < MAX_SPREAD else None
 
 
 def _meshes(photo: NDArray[np.uint8], squares: list[Square]) -> list[NDArray[np.float64] | None]:

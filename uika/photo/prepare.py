@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.photo import matte
-from uika.photo.crop import Square, coverage, resample, to_crop
+from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
 from uika.photo.detect import find_face
 from uika.photo.error import PhotoError
 from uika.photo.nets import person_mask
-from uika.photo.outline import CHIN, FOREHEAD, OVAL, polygon
+from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
 
 HEAD_TO_FACE = 1.35  # height of a head over the height of its face, forehead line to chin
 CROP_TO_HEAD = 1.5  # side of the crop over the larger side of the head box (released inference settings)
 HAIR_LIMIT = 1.0  # hair is looked for up to this many face heights beyond the face
+EDGE_STEP = 0.02  # of the crop: the segmentation is unreliable this close to the photo's edge
 SCAN_SIDE = 256  # pixels, the resolution of the segmentation model
 MIN_SIZE, MAX_SIZE = 64, 2048
 
@@ -64,12 +65,12 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
     crop = resample(rgb, square, size)
-    alpha = _matte(crop, landmarks)
+    inside = coverage(rgb.shape[:2], square, size)
+    alpha = _matte(crop, landmarks, inside)
     colours = matte.foreground(crop, alpha)
     if picture.alpha is not None:
         given = (resample(picture.alpha, square, size) / 255).astype(np.float32)
         alpha, colours = _merge(alpha, given, colours, resample(picture.rgb, square, size))
-    inside = coverage(rgb.shape[:2], square, size)
     alpha = alpha * inside
     plain = np.array(background, dtype=np.float32)
     return Photo(
@@ -93,31 +94,40 @@ def _opaque(picture: Picture, background: tuple[float, float, float]) -> NDArray
 
 
 def _head_square(rgb: NDArray[np.uint8], face: NDArray[np.float64]) -> Square:
-    """Crop around the head: the face's box extended upwards, then widened to the hair that the segmentation shows."""
-    height = float(np.linalg.norm(face[FOREHEAD] - face[CHIN]))
-    low, high = face.min(axis=0), face.max(axis=0)
-    low, high = np.minimum(low, [low[0], high[1] - HEAD_TO_FACE * height]), high.copy()
-    reach = height * HAIR_LIMIT
-    side = float((high - low).max()) + 2 * reach
-    scan = (float((low + high)[0] - side) / 2, float((low + high)[1] - side) / 2, side)
+    """Crop around the head: the face's box extended over the skull, then over the hair that the segmentation shows."""
+    up = face[FOREHEAD] - face[CHIN]
+    height = float(np.linalg.norm(up))
+    head = np.concatenate([face, face + (HEAD_TO_FACE - 1) * up])
+    low, high = head.min(axis=0), head.max(axis=0)
+    side = float((high - low).max()) + 2 * HAIR_LIMIT * height
+    x0, y0 = (low + high - side) / 2
+    scan = (float(x0), float(y0), side)
     person = person_mask(resample(rgb, scan, SCAN_SIDE)) * coverage(rgb.shape[:2], scan, SCAN_SIDE) > 0.5
-    x, y = (np.arange(SCAN_SIDE) + 0.5) * side / SCAN_SIDE + np.array(scan[:2])[:, None]
-    mouth_row = face[[61, 291], 1].mean()  # lower rows show shoulders
-    person &= (y < mouth_row)[:, None] & (np.abs(x - (low + high)[0] / 2) < (high - low)[0] / 2 + reach)[None]
-    rows, columns = np.nonzero(person)
-    if rows.size:
-        low = np.minimum(low, [x[columns.min()], max(y[rows.min()], low[1] - reach)])
-        high[0] = max(high[0], x[columns.max()])
+    across, above = face_frame(face, to_photo(pixel_centres(SCAN_SIDE), scan, SCAN_SIDE))
+    sideways = face_frame(face, face)[0]
+    person &= (across > sideways.min() - HAIR_LIMIT) & (across < sideways.max() + HAIR_LIMIT)
+    person &= above > face_frame(face, face[list(MOUTH_CORNERS)])[1].mean()  # shoulders show below
+    hair = to_photo(pixel_centres(SCAN_SIDE)[person], scan, SCAN_SIDE)
+    head = np.concatenate([head, hair])
+    low, high = head.min(axis=0), head.max(axis=0)
     side = CROP_TO_HEAD * float((high - low).max())
     x0, y0 = (low + high - side) / 2
     return float(x0), float(y0), side
 
 
-def _matte(crop: NDArray[np.uint8], landmarks: NDArray[np.float64]) -> NDArray[np.float32]:
+def _matte(crop: NDArray[np.uint8], landmarks: NDArray[np.float64], inside: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Matte [S,S] of a crop [S,S,3]; where `inside` [S,S] is 0, crop and mask repeat the photo's edge."""
     size = crop.shape[0]
     oval = landmarks[list(OVAL)]
     sure = polygon(oval.mean(axis=0) + 0.85 * (oval - oval.mean(axis=0)), size)
-    return matte.solve(crop, matte.trimap(person_mask(crop), sure))
+    rough = person_mask(crop)
+    step = round(EDGE_STEP * size)
+    for axis in (0, 1):
+        seen = np.flatnonzero(inside.max(axis=1 - axis) > 0)
+        first = seen[0] + (step if seen[0] > 0 else 0)
+        last = seen[-1] - (step if seen[-1] < size - 1 else 0)
+        rough = rough.take(np.arange(size).clip(first, last), axis=axis)
+    return matte.solve(crop, matte.trimap(rough, sure))
 
 
 def _merge(

@@ -17,7 +17,7 @@ from uika.photo.error import PhotoError
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 512 * 1024 * 1024
 MIN_SIDE = 64
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "HEIF")  # MPO: JPEGs of phones that hold more than one picture
+FORMATS = ("JPEG", "PNG", "WEBP", "HEIF")
 KINDS = "JPEG, PNG, WebP or HEIC"
 
 
@@ -39,7 +39,8 @@ def read(path: str | Path) -> Picture:
     """Read a JPEG, PNG, WebP or HEIC file with its EXIF rotation and its colour profile applied.
 
     Grey, palette, CMYK and 16-bit files become 8-bit RGB. The pixel count is checked from the header, before
-    anything is decoded. Raises `PhotoError` for a file that is missing, empty, truncated, too large, too small or no photo.
+    anything is decoded. Raises `PhotoError` for a file that is missing, empty, cut short, too large, too small
+    or no photo.
     """
     data = _read_bytes(Path(path))
     with warnings.catch_warnings():
