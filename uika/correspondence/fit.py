@@ -1,0 +1,75 @@
+"""Fit the head to photos: landmarks first, then the hair's silhouette."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from uika.correspondence.hair import fit_hair
+from uika.correspondence.landmarks import fit_landmarks
+from uika.head import Camera, HeadModel, HeadParameters
+
+
+class FittablePhoto(Protocol):
+    """What the fit needs of a photo: its landmarks [478,2] and matte [S,S] in crop pixels."""
+
+    @property
+    def landmarks(self) -> Tensor:
+        """Face mesh points [478,2], pixels."""
+
+    @property
+    def matte(self) -> Tensor:
+        """Person matte [S,S] in [0,1]."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """N fitted photos.
+
+    parameters: [N] head parameters with one identity; the cameras carry the head's pose.
+    cameras: [N] cameras at the crops' size. static_offset [V,3] metres, the hair's displacement of the neutral head.
+    error [N]: mean landmark distance in outer eye-corner distances.
+    """
+
+    parameters: HeadParameters
+    cameras: Camera
+    static_offset: Tensor
+    error: Tensor
+
+
+def fit_photos(photos: Sequence[FittablePhoto], head: HeadModel, head_mattes: Sequence[Tensor] | None = None) -> Fit:
+    """Fit one identity to all photos and expression, camera and hair to each (float32).
+
+    Args:
+        photos: prepared photos of one person, all cropped to the same size.
+        head: the head model.
+        head_mattes: [S,S] per photo, head and hair without shoulders; None fits no hair.
+
+    Raises:
+        ValueError: there is no photo, or the photos have different sizes.
+    """
+    if not photos:
+        raise ValueError("photos: give at least one photo")
+    sizes = {tuple(photo.matte.shape) for photo in photos}
+    if len(sizes) > 1:
+        raise ValueError(f"photos: all crops must have one size, got {sorted(sizes)}")
+    height, width = sizes.pop()
+    found = fit_landmarks(torch.stack([photo.landmarks for photo in photos]), head, width)
+    N = len(photos)
+    viewmat = torch.eye(4).repeat(N, 1, 1)
+    viewmat[:, :3, :3], viewmat[:, :3, 3] = found.rotation.float(), found.translation.float()
+    K = torch.eye(3).repeat(N, 1, 1)
+    K[:, 0, 0] = K[:, 1, 1] = found.focal.float()
+    K[:, 0, 2], K[:, 1, 2] = width / 2, height / 2
+    cameras = Camera(viewmat, K, width, height)
+    parameters = HeadParameters.zeros(head, N).replace(
+        identity=found.identity.float().expand(N, -1).contiguous(), expression=found.expression.float()
+    )
+    offset = torch.zeros_like(head.template)
+    if head_mattes is not None:
+        offset = fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
+    return Fit(parameters, cameras, offset, found.error.float())

@@ -1,0 +1,158 @@
+"""Displace the scalp until the head's silhouette meets the matte, so that hair has a surface to live on.
+
+The built-in head is bald. Vertices off the face move along their normals, smoothly and by at most the paper's 0.1 m
+(supplement, Table S1: offset range), in rounds: outline vertices learn how far the matte reaches beyond them, a
+membrane spreads that over the scalp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project, vertex_normals
+
+MAX_OFFSET, MIN_OFFSET = 0.1, -0.02  # metres; hair pressed flat may lie inside the average skull
+ROUNDS = 8
+ANGLES = 180  # directions around the head in which the outline is compared
+OUTLINE_SHARE = 0.985  # vertices this close to the outline, relative to its radius, belong to it
+RADII = 192
+BENDING, TENSION = 30.0, 0.05  # smoothness of the offset field against the outline's pull
+BACK_PULL = 1e-3
+FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
+NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
+
+
+@dataclass(frozen=True)
+class _Region:
+    vertices: Tensor  # [R] vertex ids that may move
+    smoothness: Any  # [R,R] sparse quadratic form of the membrane
+    share: Tensor  # [R] in [0,1], how freely each may move
+
+
+def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor) -> Tensor:
+    """Offset [V,3] in metres that makes the silhouette meet the matte in every photo.
+
+    Args:
+        head: the head model.
+        parameters: [N] fitted parameters, one identity.
+        cameras: [N] fitted cameras.
+        mattes: [N,S,S] head and hair without shoulders, in [0,1].
+    """
+    edges = _edges(head)
+    region = _region(head, edges)
+    reach = torch.stack([_reach(matte, at[0]) for matte, at in zip(mattes, _centres(head, parameters, cameras), strict=True)])
+    canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
+    normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
+    height = torch.zeros(len(head.template))
+    for _ in range(ROUNDS):
+        vertices = pose_vertices(head, parameters, height[:, None] * normals)
+        wanted, pull = _outline_demand(head, vertices, cameras, reach, region)
+        height = _membrane(region, height, wanted, pull)
+    return height[:, None] * normals
+
+
+def _edges(head: HeadModel) -> Tensor:
+    """Directed edges [D,2] of the mesh, both ways."""
+    corners = head.faces
+    edges = torch.cat((corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]))
+    return torch.cat((edges, edges.flip(1))).unique(dim=0)
+
+
+def _smooth_normals(normals: Tensor, edges: Tensor) -> Tensor:
+    for _ in range(NORMAL_ROUNDS):
+        normals = normals.index_add(0, edges[:, 0], normals[edges[:, 1]])
+        normals = torch.nn.functional.normalize(normals, dim=-1)
+    return normals
+
+
+def _region(head: HeadModel, edges: Tensor) -> _Region:
+    """Vertices off the face, with the bending energy of the offset field over the mesh."""
+    from scipy import sparse
+
+    inner = head.masks["mouth_inner"] + head.masks["eyeballs"]
+    front_neck = head.masks["neck"] * (head.template[:, 2] > 0.0)
+    share = (1.0 - head.masks["face"] - front_neck).clamp(0, 1) * (inner < 0.5)
+    vertices = torch.nonzero(share > 0.02).flatten()
+    R = len(vertices)
+    place = torch.full((len(share),), -1)
+    place[vertices] = torch.arange(R)
+    length = (head.template[edges[:, 0]] - head.template[edges[:, 1]]).norm(dim=-1).clamp(min=1e-4)
+    inside = place[edges[:, 0]] >= 0
+    start, end = place[edges[inside, 0]].numpy(), place[edges[inside, 1]].numpy()
+    weight = (1.0 / length[inside]).double().numpy()
+    degree = np.bincount(start, weight, R)
+    both = end >= 0
+    # A neighbour on the face counts in the degree only: it holds the field at zero, hair starts at the skin.
+    adjacency = sparse.csr_matrix((weight[both], (start[both], end[both])), shape=(R, R))
+    laplacian = sparse.identity(R) - sparse.diags(1.0 / degree) @ adjacency
+    smoothness = BENDING * laplacian.T @ laplacian + 0.5 * TENSION * (laplacian + laplacian.T)
+    return _Region(vertices, smoothness, share[vertices])
+
+
+def _centres(head: HeadModel, parameters: HeadParameters, cameras: Camera) -> Tensor:
+    """Pixels [N,1,2] of a point inside each posed skull from which the hair's outline is seen in every direction."""
+    return project(_scalp_mean(head, pose_vertices(head, parameters)), cameras)[0]
+
+
+def _scalp_mean(head: HeadModel, vertices: Tensor) -> Tensor:
+    return (vertices * head.masks["scalp"][:, None]).sum(-2, keepdim=True) / head.masks["scalp"].sum()
+
+
+def _reach(matte: Tensor, centre: Tensor) -> Tensor:
+    """Radius [ANGLES] in pixels of the matte's outline around `centre`; NaN where it leaves the picture."""
+    S = matte.shape[0]
+    angle = (torch.arange(ANGLES) + 0.5) * (2 * torch.pi / ANGLES)
+    radius = torch.linspace(0.0, 0.75 * S, RADII * 2)
+    along = torch.stack((angle.cos(), angle.sin()), -1)
+    points = centre + radius[:, None, None] * along
+    grid = points / S * 2 - 1
+    value = torch.nn.functional.grid_sample(matte[None, None], grid[None], align_corners=False)[0, 0]
+    inside = value > 0.5
+    last = torch.where(inside, radius[:, None], torch.zeros(())).amax(0)
+    edge = centre + last[:, None] * along
+    cut = ((edge < 2.0) | (edge > S - 2.0)).any(-1) | ~inside.any(0)
+    return torch.where(cut, torch.nan, last)
+
+
+def _outline_demand(
+    head: HeadModel, vertices: Tensor, cameras: Camera, reach: Tensor, region: _Region
+) -> tuple[Tensor, Tensor]:
+    """How far each region vertex should move along its normal [R] in metres, and how strongly [R], over all photos."""
+    pixels, depth = project(vertices, cameras)
+    normals = torch.nn.functional.normalize(vertex_normals(vertices, head.faces), dim=-1)
+    turn = cameras.viewmat[..., :3, :3]
+    normals = normals @ turn.mT
+    middle, _ = project(_scalp_mean(head, vertices), cameras)
+    ray = pixels - middle
+    radius = ray.norm(dim=-1).clamp(min=1e-6)
+    sector = (torch.atan2(ray[..., 1], ray[..., 0]) % (2 * torch.pi) / (2 * torch.pi) * ANGLES).long() % ANGLES
+    skin = head.masks["mouth_inner"] + head.masks["eyeballs"] < 0.5
+    outline = torch.zeros(len(pixels), ANGLES).scatter_reduce(1, sector, radius * skin, "amax")
+    spread = torch.nn.functional.max_pool1d(torch.cat((outline[:, -1:], outline, outline[:, :1]), 1)[:, None], 3, 1)[:, 0]
+    gap = reach.gather(1, sector) - radius
+    outward = (normals[..., :2] * ray / radius[..., None]).sum(-1)
+    at = (radius > OUTLINE_SHARE * spread.gather(1, sector)) & (outward > 0.3) & gap.isfinite()
+    metres = gap.nan_to_num() * depth / cameras.K[..., 0, 0][:, None] / outward.clamp(min=0.5)
+    weight = at.float()
+    total = weight.sum(0).clamp(min=1e-9)
+    wanted = (weight * metres).sum(0) / total
+    return wanted[region.vertices], weight.sum(0)[region.vertices] * region.share
+
+
+def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor) -> Tensor:
+    """Heights [V] after one round: outline vertices reach for their target, the rest follows smoothly."""
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
+    weight = pull.double().numpy()
+    target = (height[region.vertices] + wanted).clamp(MIN_OFFSET, MAX_OFFSET).double().numpy()
+    stiff = FACE_PULL * (1.0 / region.share.double().clamp(min=0.02).numpy() - 1.0)
+    solved = spsolve((region.smoothness + sparse.diags(weight + BACK_PULL + stiff)).tocsc(), weight * target)
+    out = torch.zeros_like(height)
+    out[region.vertices] = torch.from_numpy(solved).float().clamp(MIN_OFFSET, MAX_OFFSET)
+    return out

@@ -1,0 +1,244 @@
+"""Fit one identity and, for each photo, expression, pose and a pinhole camera to face-mesh landmarks.
+
+A damped Gauss-Newton solve with closed-form Jacobians: landmarks are linear in identity and expression, so a step costs
+milliseconds. The photos couple only through the identity, which a Schur complement exploits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from uika.head import HeadModel
+
+MESH_POINTS = 478
+FIRST_IRIS = 468
+EYE_CORNERS = (33, 263)  # outer corners of the right and left eye
+# Contours of eyelids and lips: small errors there are the ones people see.
+EYELIDS = (
+    33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246,
+    263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466,
+)  # fmt: skip
+LIPS = (
+    61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185,
+    78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191,
+)  # fmt: skip
+CONTOUR_WEIGHT = 3.0
+UNFITTED = ("tongueOut",)  # no landmark sees the tongue
+
+NOISE = 0.02  # expected landmark error, in outer eye-corner distances
+ROBUST_SCALE = 0.04  # errors beyond this many eye-corner distances lose influence (Geman-McClure)
+IDENTITY_PRIOR = (3.0, 1.2)  # weights of |identity|^2 in the two rounds
+EXPRESSION_PRIOR = 2.0
+BOUND_WEIGHT = 60.0  # soft walls at activations 0 and 1
+DISTANCE, DISTANCE_SPREAD = 1.1, 0.35  # metres and log-spread: focal length and distance trade off on one photo
+STEPS = (12, 18)
+MAX_DAMPING = 1e9
+
+
+@dataclass(frozen=True)
+class LandmarkFit:
+    """N fitted photos; all float64.
+
+    identity [K]; expression [N,E]; rotation [N,3,3] and translation [N,3] (head to camera, metres); focal [N] pixels;
+    error [N] mean landmark distance in outer eye-corner distances (measured in 3D scale, so that it holds in profile).
+    """
+
+    identity: Tensor
+    expression: Tensor
+    rotation: Tensor
+    translation: Tensor
+    focal: Tensor
+    error: Tensor
+
+
+@dataclass(frozen=True)
+class _Problem:
+    points: Tensor  # [L,3] mean landmarks
+    identity: Tensor  # [K,L,3]
+    expression: Tensor  # [E,L,3]
+    target: Tensor  # [N,L,2] pixels relative to the principal point
+    weight: Tensor  # [L]
+    shape_rows: Tensor  # [L] 1 where the landmark tells about identity
+    free: Tensor  # [E] 1 where the expression is fitted
+    pixel_unit: Tensor  # [N] pixels of one outer eye-corner distance
+    identity_prior: float
+
+
+def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
+    """Fit the head to N photos.
+
+    Args:
+        landmarks: [N,478,2] pixels in square crops of `size`, centres at +0.5.
+        head: the head model (with its landmark embedding).
+        size: side of the crops; the principal point is taken at the centre.
+
+    Raises:
+        ValueError: the landmarks have another shape or are not finite.
+    """
+    if landmarks.ndim != 3 or landmarks.shape[1:] != (MESH_POINTS, 2) or len(landmarks) == 0:
+        raise ValueError(f"landmarks: need [N,{MESH_POINTS},2] with N >= 1, got {tuple(landmarks.shape)}")
+    if not torch.isfinite(landmarks).all():
+        raise ValueError("landmarks: all values must be finite")
+    exact = head.to(torch.float64)
+    K, E = len(exact.identity_basis), len(exact.expression_names)
+    ids = exact.landmark_ids
+    weight = exact.landmark_weights.clone()
+    weight[torch.isin(ids, torch.tensor(EYELIDS + LIPS))] *= CONTOUR_WEIGHT
+    problem = _Problem(
+        points=exact.landmarks(exact.template),
+        identity=exact.landmarks(exact.identity_basis),
+        expression=exact.landmarks(exact.expression_basis),
+        target=landmarks.double()[:, ids] - size / 2,
+        weight=weight / weight.mean(),
+        shape_rows=(ids < FIRST_IRIS).double(),
+        free=torch.tensor([name not in UNFITTED for name in exact.expression_names], dtype=torch.float64),
+        pixel_unit=torch.ones(len(landmarks), dtype=torch.float64),
+        identity_prior=IDENTITY_PRIOR[0],
+    )
+    rotation, translation, focal, unit = _weak_perspective(problem, _eye_distance(exact))
+    problem = replace(problem, pixel_unit=unit)
+    N = len(landmarks)
+    state = LandmarkFit(
+        torch.zeros(K, dtype=torch.float64),
+        torch.zeros(N, E, dtype=torch.float64),
+        rotation,
+        translation,
+        focal,
+        torch.zeros(N, dtype=torch.float64),
+    )
+    for prior, steps in zip(IDENTITY_PRIOR, STEPS, strict=True):
+        state = _solve(replace(problem, identity_prior=prior), state, steps)
+    distance = (_project(problem, state)[0] - problem.target).norm(dim=-1)
+    return replace(state, error=distance.mean(-1) / problem.pixel_unit)
+
+
+def _eye_distance(head: HeadModel) -> float:
+    """Metres between the outer eye corners of the mean head."""
+    points = head.landmarks(head.template)
+    at = [int(torch.nonzero(head.landmark_ids == corner)[0]) for corner in EYE_CORNERS]
+    return float((points[at[0]] - points[at[1]]).norm())
+
+
+def _weak_perspective(problem: _Problem, eye_distance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Start: the affine camera of the mean head by linear least squares, made a rotation at the usual distance."""
+    centre = problem.points.mean(0)
+    shape = problem.points - centre
+    middle = problem.target.mean(1)
+    affine = torch.linalg.lstsq(shape.expand(len(middle), -1, -1), problem.target - middle[:, None]).solution.mT
+    u, s, vt = torch.linalg.svd(affine, full_matrices=False)
+    rows = u @ vt
+    scale = s.mean(-1)
+    rotation = torch.stack((rows[:, 0], rows[:, 1], torch.linalg.cross(rows[:, 0], rows[:, 1])), 1)
+    depth = torch.full_like(scale, DISTANCE)
+    focal = scale * depth
+    translation = torch.cat((middle / scale[:, None], depth[:, None]), -1) - rotation @ centre
+    return rotation, translation, focal, scale * eye_distance
+
+
+def _project(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Tensor]:
+    """Pixels [N,L,2] relative to the principal point, and camera-space points [N,L,3]."""
+    points = problem.points + torch.einsum("k,klc->lc", state.identity, problem.identity)
+    points = points + torch.einsum("ne,elc->nlc", state.expression, problem.expression)
+    camera = points @ state.rotation.mT + state.translation[:, None]
+    return state.focal[:, None, None] * camera[..., :2] / camera[..., 2:], camera
+
+
+def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
+    pixels, camera = _project(problem, state)
+    square = ((pixels - problem.target) / problem.pixel_unit[:, None, None]).square().sum(-1)
+    robust = ROBUST_SCALE**2 * square / (ROBUST_SCALE**2 + square) / NOISE**2
+    outside = state.expression - state.expression.clamp(0, 1)
+    cost = (problem.weight * robust).sum() + problem.identity_prior * state.identity.square().sum()
+    cost = cost + EXPRESSION_PRIOR * state.expression.square().sum() + BOUND_WEIGHT * outside.square().sum()
+    cost = cost + ((state.translation[:, 2].clamp(min=1e-3) / DISTANCE).log() / DISTANCE_SPREAD).square().sum()
+    behind = (camera[..., 2] <= 1e-3).any()
+    return torch.where(behind, torch.full_like(cost, torch.inf), cost)
+
+
+def _solve(problem: _Problem, state: LandmarkFit, steps: int) -> LandmarkFit:
+    damping, cost = 1e-3, _cost(problem, state)
+    for _ in range(steps):
+        system = _normal_equations(problem, state)
+        while damping < MAX_DAMPING:
+            trial = _apply(state, *_schur_step(*system, damping))
+            trial_cost = _cost(problem, trial)
+            if trial_cost <= cost:
+                break
+            damping *= 8.0
+        else:
+            return state
+        state, cost, damping = trial, trial_cost, max(damping / 5.0, 1e-6)
+    return state
+
+
+def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blocks A [K,K], B [N,K,P], C [N,P,P] of the Gauss-Newton matrix and right sides a [K], c [N,P]; P = E + 7."""
+    pixels, camera = _project(problem, state)
+    N, L = pixels.shape[:2]
+    E = state.expression.shape[1]
+    residual = (pixels - problem.target) / problem.pixel_unit[:, None, None]
+    robust = (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + residual.square().sum(-1))).square()
+    root = (problem.weight * robust).sqrt()[..., None] / NOISE
+    z = camera[..., 2]
+    zero = torch.zeros_like(z)
+    f = state.focal[:, None] / problem.pixel_unit[:, None] / z
+    x, y = camera[..., 0] / z, camera[..., 1] / z
+    d_camera = torch.stack((torch.stack((f, zero, -f * x), -1), torch.stack((zero, f, -f * y), -1)), -2)
+    d_head = d_camera @ state.rotation[:, None]
+    j_shape = torch.einsum("nlij,klj->nlik", d_head, problem.identity) * problem.shape_rows[:, None, None]
+    j_expression = torch.einsum("nlij,elj->nlie", d_head, problem.expression) * problem.free
+    turned = camera - state.translation[:, None]
+    cross = torch.zeros(N, L, 3, 3, dtype=z.dtype)
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = turned[..., 2], -turned[..., 1], turned[..., 0]
+    cross = cross - cross.mT
+    d_focal = (pixels / problem.pixel_unit[:, None, None])[..., None]
+    j_photo = torch.cat((j_expression, d_camera @ cross, d_camera, d_focal), -1)
+    rows = (root * residual).reshape(N, -1, 1)
+    j_shape = (root[..., None] * j_shape).reshape(N, 2 * L, -1)
+    j_photo = (root[..., None] * j_photo).reshape(N, 2 * L, -1)
+    A = (j_shape.mT @ j_shape).sum(0)
+    B = j_shape.mT @ j_photo
+    C = j_photo.mT @ j_photo
+    a = (j_shape.mT @ rows).sum(0)[:, 0]
+    c = (j_photo.mT @ rows)[..., 0]
+    A.diagonal().add_(problem.identity_prior)
+    a = a + problem.identity_prior * state.identity
+    outside = state.expression - state.expression.clamp(0, 1)
+    curvature = EXPRESSION_PRIOR + BOUND_WEIGHT * (outside != 0).double()
+    C.diagonal(dim1=-2, dim2=-1)[:, :E].add_(curvature)
+    c[:, :E] += EXPRESSION_PRIOR * state.expression + BOUND_WEIGHT * outside
+    depth = state.translation[:, 2]
+    slope = 1.0 / (DISTANCE_SPREAD * depth)
+    C[:, E + 5, E + 5] += slope.square()
+    c[:, E + 5] += slope * (depth / DISTANCE).log() / DISTANCE_SPREAD
+    return A, B, C, a, c
+
+
+def _schur_step(A: Tensor, B: Tensor, C: Tensor, a: Tensor, c: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """Solve for the shared step [K] and the photos' steps [N,P]."""
+    C = C + torch.diag_embed(damping * C.diagonal(dim1=-2, dim2=-1) + 1e-9)
+    A = A + torch.diag(damping * A.diagonal())
+    factor = torch.linalg.cholesky(C)
+    eliminated = torch.cholesky_solve(torch.cat((B.mT, c[..., None]), -1), factor)
+    reduced = A - (B @ eliminated[..., :-1]).sum(0)
+    right = a - (B @ eliminated[..., -1:]).sum(0)[:, 0]
+    shared = -torch.linalg.solve(reduced, right)
+    return shared, -(eliminated[..., -1] + eliminated[..., :-1] @ shared)
+
+
+def _apply(state: LandmarkFit, shared: Tensor, photos: Tensor) -> LandmarkFit:
+    E = state.expression.shape[1]
+    turn = torch.zeros(len(photos), 3, 3, dtype=photos.dtype)
+    w = photos[:, E : E + 3]
+    turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0] = w[:, 0], w[:, 1], w[:, 2]
+    return replace(
+        state,
+        identity=state.identity + shared,
+        expression=state.expression + photos[:, :E],
+        rotation=torch.linalg.matrix_exp(turn - turn.mT) @ state.rotation,
+        translation=state.translation + photos[:, E + 3 : E + 6],
+        focal=state.focal * photos[:, E + 6].clamp(-0.5, 0.5).exp(),
+    )

@@ -1,0 +1,54 @@
+"""From a fitted head to pixel-wise correspondence: the UV coordinate that each foreground pixel shows (paper 3.1)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from uika.correspondence.fit import Fit
+from uika.head import HeadModel, pose_vertices, project, rasterize, vertex_normals
+
+SURE_MATTE, FULL_MATTE = 0.6, 0.95  # matte values between which a pixel gains weight: edges carry background light
+GRAZING, FACING = 0.08, 0.55  # cosines between which a pixel gains weight: grazing pixels smear over many texels
+
+
+def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rasterize the fitted head into each photo; the nearest front-facing surface wins.
+
+    Args:
+        fit: the fit of N photos.
+        head: the head model it was made with.
+        mattes: [N,S,S] person mattes in [0,1]; S must be the size the cameras were fitted for.
+
+    Returns:
+        uv [N,S,S,2] in [0,1] with v measured from the top (0 where nothing is hit), valid [N,S,S] bool,
+        weight [N,S,S] in [0,1]: trust from the matte and the viewing angle, 0 where not valid.
+    """
+    size = fit.cameras.width
+    if mattes.shape[1:] != (size, fit.cameras.height) or len(mattes) != len(fit.error):
+        raise ValueError(f"mattes: need [{len(fit.error)},{fit.cameras.height},{size}], got {tuple(mattes.shape)}")
+    corner_uv = head.uvs[head.uv_faces] * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0])
+    vertices = pose_vertices(head, fit.parameters, fit.static_offset)
+    uv, valid, weight = [], [], []
+    for n, matte in enumerate(mattes):
+        camera = fit.cameras[n]
+        points, depth = project(vertices[n], camera)
+        triangle, mix = rasterize(points, head.faces, camera.height, camera.width, depth=depth, cull="back")
+        hit = triangle >= 0
+        at = triangle.clamp(min=0)
+        place = (corner_uv[at] * mix[..., None]).sum(-2).clamp(0, 1)
+        corners = head.faces[at]
+        normal = normalize((vertex_normals(vertices[n], head.faces)[corners] * mix[..., None]).sum(-2), dim=-1)
+        surface = (vertices[n][corners] * mix[..., None]).sum(-2)
+        cosine = (normal * normalize(camera.position - surface, dim=-1)).sum(-1)
+        trust = _ramp(matte, SURE_MATTE, FULL_MATTE) * _ramp(cosine, GRAZING, FACING)
+        seen = hit & (trust > 0)
+        uv.append(torch.where(seen[..., None], place, torch.zeros(())))
+        valid.append(seen)
+        weight.append(trust * seen)
+    return torch.stack(uv), torch.stack(valid), torch.stack(weight)
+
+
+def _ramp(value: Tensor, low: float, high: float) -> Tensor:
+    return ((value - low) / (high - low)).clamp(0, 1)
