@@ -104,6 +104,32 @@ def test_mirror_of_minus_one_is_not_used() -> None:
     torch.testing.assert_close(result, fill(rgb, seen, valid))
 
 
+def test_diffusion_stays_in_its_region() -> None:
+    rgb = torch.zeros(1, 3, 40, 40)
+    rgb[..., 4, 4], rgb[..., 30, 30] = 0.2, 0.9
+    seen = (rgb[:, :1] > 0).float()
+    regions = torch.zeros(40, 40, dtype=torch.int64)
+    regions[20:] = 5
+    valid = torch.ones(40, 40, dtype=torch.bool)
+    valid[19:21] = False
+    result = fill(rgb, seen, valid, regions=regions)
+    torch.testing.assert_close(result[..., :19, :], torch.full((1, 3, 19, 40), 0.2))
+    torch.testing.assert_close(result[..., 21:, :], torch.full((1, 3, 19, 40), 0.9))
+
+
+def test_unseen_region_gets_the_default_or_the_prior() -> None:
+    rgb, seen = torch.full((1, 3, 24, 24), 0.3), torch.ones(1, 1, 24, 24)
+    seen[..., 12:, :] = 0
+    regions = torch.zeros(24, 24, dtype=torch.int64)
+    regions[12:] = 1
+    prior = torch.full((3, 24, 24), float("nan"))
+    prior[:, :, :12] = 0.8
+    result = fill(rgb, seen, torch.ones(24, 24, dtype=torch.bool), regions=regions, prior=prior)
+    torch.testing.assert_close(result[..., :12, :], rgb[..., :12, :])
+    torch.testing.assert_close(result[..., 12:, :12], torch.full((1, 3, 12, 12), 0.8))
+    torch.testing.assert_close(result[..., 12:, 12:], torch.full((1, 3, 12, 12), 0.5))
+
+
 def test_bad_arguments_are_named() -> None:
     rgb, confidence = torch.zeros(1, 3, 8, 8), torch.zeros(1, 1, 8, 8)
     valid = torch.ones(8, 8, dtype=torch.bool)
@@ -115,6 +141,10 @@ def test_bad_arguments_are_named() -> None:
         fill(rgb, confidence, valid.float())
     with pytest.raises(ValueError, match="mirror must be"):
         fill(rgb, confidence, valid, torch.zeros(4, 4, dtype=torch.int64))
+    with pytest.raises(ValueError, match="regions must be"):
+        fill(rgb, confidence, valid, regions=valid)
+    with pytest.raises(ValueError, match="prior must be"):
+        fill(rgb, confidence, valid, prior=rgb)
     with pytest.raises(ValueError, match="beyond 63"):
         fill(rgb, confidence, valid, torch.full((8, 8), 64))
 

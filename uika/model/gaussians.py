@@ -18,12 +18,16 @@ class SurfaceTexels:
     scales  [B,M,3] metres: standard deviations that close the surface, two tangent sizes and a thin normal one
     mirror  [S,S] int64 row-major index of each texel's counterpart on the other half of the face, -1 where there is
             none; None if unknown
+    regions [S,S] int64 labels of parts whose colours do not mix (skin, eyeballs, teeth), or None
+    prior   [3,S,S] colours for texels that neither a photo nor its mirror image shows, NaN where there is none, or None
     """
 
     points: Tensor
     quats: Tensor
     scales: Tensor
     mirror: Tensor | None = None
+    regions: Tensor | None = None
+    prior: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ class Reconstructor(nn.Module):
         diffusion). Raises ValueError for shapes that do not fit.
         """
         self._check(images, texel, surface)
-        seen = self.observe(images, masks, pixel_uv, pixel_weight, texel, surface.mirror)
+        seen = self.observe(images, masks, pixel_uv, pixel_weight, texel, surface)
         size = (self.config.image_size, self.config.image_size)
         photos = resize(images.flatten(0, 1), size, antialias=True).unflatten(0, images.shape[:2])
         tokens = self.transformer(self.encoder.screen(photos), self.encoder.uv(seen.views))
@@ -109,7 +109,7 @@ class Reconstructor(nn.Module):
         pixel_uv: Tensor,
         pixel_weight: Tensor | None,
         texel: Tensor,
-        mirror: Tensor | None = None,
+        surface: SurfaceTexels,
     ) -> Observation:
         """The part without learned weights: reprojection, aggregation and filling. Arguments as in `forward`."""
         config = self.config.uv
@@ -143,7 +143,8 @@ class Reconstructor(nn.Module):
         empty = int(((pooled.hits <= 0) & valid).sum())
         color = pooled.rgb
         if config.fill:
-            color = fill(color, (pooled.trust / config.full_trust).clamp(0, 1), valid, mirror)
+            share = (pooled.trust / config.full_trust).clamp(0, 1)
+            color = fill(color, share, valid, surface.mirror, regions=surface.regions, prior=surface.prior)
         report = {
             "views": images.shape[0] * images.shape[1],
             "empty_views": int((view_hits.amax(dim=(2, 3, 4)) <= 0).sum()),

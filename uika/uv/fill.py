@@ -19,6 +19,9 @@ def fill(
     valid: Tensor,
     mirror: Tensor | None = None,
     default: tuple[float, float, float] = (0.5, 0.5, 0.5),
+    *,
+    regions: Tensor | None = None,
+    prior: Tensor | None = None,
 ) -> Tensor:
     """Complete a UV observation.
 
@@ -28,19 +31,39 @@ def fill(
     valid       [S,S] bool texels that belong to the head; no other texel is ever a source
     mirror      [S,S] int64 row-major index of the texel on the other half of the face, -1 where there is none
     default     colour where nothing at all was seen
+    regions     [S,S] int64 labels; diffusion does not cross from one label to another (skin, eyeballs, teeth)
+    prior       [3,S,S] colours to use instead of diffusion (teeth behind closed lips), NaN where there is none
 
     A texel takes its own colour, then (as far as that is missing) the mirrored one, corrected by the smooth lighting
-    difference between both halves, then the diffusion of what is known. Returns [B,3,S,S]; texels outside `valid`
-    carry the diffused colour so that resizing the map does not darken the borders of charts.
+    difference between both halves, then the prior, then the diffusion of what is known. Returns [B,3,S,S]; texels
+    outside `valid` carry diffused colour so that resizing the map does not darken the borders of charts.
+    Raises ValueError for arguments that do not fit.
     """
-    _check(rgb, confidence, valid, mirror)
+    _check(rgb, confidence, valid, mirror, regions, prior)
     known = torch.nan_to_num(confidence).clamp(0, 1) * valid
     color = torch.where(known > 0, rgb, torch.zeros_like(rgb))
     base = torch.tensor(default, dtype=rgb.dtype, device=rgb.device)[None, :, None, None].expand_as(rgb)
     if mirror is not None:
         color, known = _add_mirrored(color, known, valid, mirror)
-    diffused = diffuse(color, known, base)
-    return torch.where(known >= 1, color, known * color + (1 - known) * diffused)
+    completion = diffuse(color, known, base) if regions is None else _by_region(color, known, base, valid, regions)
+    if prior is not None:
+        completion = torch.where(torch.isfinite(prior), prior, completion)
+    result = torch.where(known >= 1, color, known * color + (1 - known) * completion)
+    if regions is None and prior is None:
+        return result
+    return diffuse(result, valid.to(rgb.dtype).expand_as(known), base)
+
+
+def _by_region(color: Tensor, known: Tensor, base: Tensor, valid: Tensor, regions: Tensor) -> Tensor:
+    """Diffusion inside each region, over the region's bounding box."""
+    result = base.clone()
+    for label in regions[valid].unique():
+        inside = valid & (regions == label)
+        rows, columns = inside.any(dim=1).nonzero()[:, 0], inside.any(dim=0).nonzero()[:, 0]
+        box = (..., slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        diffused = diffuse(color[box], (known * inside)[box], base[box])
+        result[box] = torch.where(inside[box], diffused, result[box])
+    return result
 
 
 def diffuse(values: Tensor, weight: Tensor, default: Tensor) -> Tensor:
@@ -88,7 +111,14 @@ def _lighting_difference(difference: Tensor, weight: Tensor) -> Tensor:
     return functional.interpolate(smooth, size=difference.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def _check(rgb: Tensor, confidence: Tensor, valid: Tensor, mirror: Tensor | None) -> None:
+def _check(
+    rgb: Tensor,
+    confidence: Tensor,
+    valid: Tensor,
+    mirror: Tensor | None,
+    regions: Tensor | None,
+    prior: Tensor | None,
+) -> None:
     if rgb.ndim != 4 or rgb.shape[1] != 3:
         raise ValueError(f"rgb must be [B,3,S,S], got {list(rgb.shape)}")
     height, width = rgb.shape[-2:]
@@ -96,8 +126,10 @@ def _check(rgb: Tensor, confidence: Tensor, valid: Tensor, mirror: Tensor | None
         raise ValueError(f"confidence must be {[rgb.shape[0], 1, height, width]}, got {list(confidence.shape)}")
     if list(valid.shape) != [height, width] or valid.dtype != torch.bool:
         raise ValueError(f"valid must be a bool map {[height, width]}, got {valid.dtype} {list(valid.shape)}")
-    if mirror is not None:
-        if list(mirror.shape) != [height, width] or mirror.dtype != torch.int64:
-            raise ValueError(f"mirror must be an int64 map {[height, width]}, got {mirror.dtype} {list(mirror.shape)}")
-        if bool((mirror >= height * width).any()):
-            raise ValueError(f"mirror holds texel indices beyond {height * width - 1}")
+    for name, labels in (("mirror", mirror), ("regions", regions)):
+        if labels is not None and (list(labels.shape) != [height, width] or labels.dtype != torch.int64):
+            raise ValueError(f"{name} must be an int64 map {[height, width]}, got {labels.dtype} {list(labels.shape)}")
+    if mirror is not None and bool((mirror >= height * width).any()):
+        raise ValueError(f"mirror holds texel indices beyond {height * width - 1}")
+    if prior is not None and list(prior.shape) != [3, height, width]:
+        raise ValueError(f"prior must be {[3, height, width]}, got {list(prior.shape)}")

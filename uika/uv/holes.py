@@ -21,8 +21,9 @@ def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, rad
     seen = weight > 0
     sums = _blur(torch.cat([values * weight, weight, seen.to(values.dtype)], dim=1), radius)
     total, neighbours = sums[:, channels : channels + 1], sums[:, channels + 1 :]
-    # Far from seen texels the separable blur is exactly 0, as every term of it is.
-    hole = ~seen & (total > 0)
+    # Not `total > 0`: some convolution algorithms leave rounding errors where every term is 0.
+    near = functional.max_pool2d(seen.to(values.dtype), 2 * radius + 1, stride=1, padding=radius) > 0
+    hole = ~seen & near
     if valid is not None:
         hole &= valid
     closed = sums[:, :channels] / torch.where(hole, total, torch.ones_like(total))
