@@ -148,6 +148,15 @@ def test_closing_fills_near_holes_only_and_keeps_seen_texels() -> None:
     assert bool((closed[0, :, ~inside] == 0).all())
 
 
+def test_vanishing_weights_stay_finite() -> None:
+    data = random_views(1, 8, 1)
+    for weight in (1e-40, 1e-20):
+        weights = torch.full_like(data["masks"], weight)
+        for value in aggregate(**data, size=12, weights=weights, oversample=2, close_radius=2):
+            assert bool(torch.isfinite(value).all())
+            assert value.max() <= 1
+
+
 def test_bad_arguments_are_named() -> None:
     data = random_views()
     with pytest.raises(ValueError, match="uv must be"):

@@ -26,8 +26,9 @@ def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, rad
     hole = ~seen & near
     if valid is not None:
         hole &= valid
-    closed = sums[:, :channels] / torch.where(hole, total, torch.ones_like(total))
-    mean_weight = total / torch.where(hole, neighbours, torch.ones_like(neighbours))
+    tiny = torch.finfo(values.dtype).tiny
+    closed = sums[:, :channels] / total.clamp_min(tiny)
+    mean_weight = total / neighbours.clamp_min(tiny)
     return torch.where(hole, closed, values), torch.where(hole, mean_weight, weight)
 
 
