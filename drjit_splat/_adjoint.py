@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import torch
 
-from ._backend import Backend, flat, packet
+from ._backend import Backend, flat, packet, write
 from ._blend_backward import MOMENTS
 from ._inputs import Settings
 from ._project import RECORD, Camera, project
@@ -86,10 +86,10 @@ def projection_adjoint(
         target = dr.empty(J.Float, n * len(values))
         for k, value in enumerate(values):
             # A culled splat's registers may hold infinities, which zero moments would turn into NaNs.
-            dr.scatter(target, dr.select(visible, dr.detach(dr.grad(value), False), 0.0), len(values) * i + k)
+            write(target, dr.select(visible, dr.detach(dr.grad(value), False), 0.0), len(values) * i + k)
         return target
 
-    results = [written(values) for values in leaves]
+    means, quats, scales, opacities = (written(values) for values in leaves)
     camera = written(view + intrinsics) if with_camera else None
-    dr.eval(results, camera)
-    return InputGradients(*results, camera)
+    dr.eval(means, quats, scales, opacities, camera)
+    return InputGradients(means, quats, scales, opacities, camera)

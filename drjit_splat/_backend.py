@@ -81,12 +81,17 @@ def packet(be: Backend, source: Any, index: Any, size: int) -> list[Any]:
     return [values[i] for i in range(size)]
 
 
-def write_packet(be: Backend, target: Any, values: list[Any], index: Any, active: Any = True) -> None:
+def write(target: Any, value: Any, index: Any, active: Any = True) -> None:
+    """Write `value` to `index`, where no other lane and no other write of this kernel goes.
+
+    The promise lets Dr.Jit keep several writes to one array in one kernel.
+    """
+    dr.scatter(target, value, index, active, mode=dr.ReduceMode.Permute)
+
+
+def write_packet(be: Backend, target: Any, values: list[Any], index: Any) -> None:
     """Write `values` (a power of two of them) to `index * len(values)` of a flat array as one packet."""
-    if len(values) == 1:
-        dr.scatter(target, values[0], index, active)
-    else:
-        dr.scatter(target, be.plain.ArrayXf(values), index, active)
+    write(target, values[0] if len(values) == 1 else be.plain.ArrayXf(values), index)
 
 
 def add_packet(be: Backend, target: Any, values: list[Any], index: Any, active: Any = True) -> None:
@@ -95,6 +100,11 @@ def add_packet(be: Backend, target: Any, values: list[Any], index: Any, active: 
         dr.scatter_add(target, values[0], index, active, mode=be.scatter_mode)
     else:
         dr.scatter_add(target, be.plain.ArrayXf(values), index, active, mode=be.scatter_mode)
+
+
+def bits_of(be: Backend, value: Any) -> Any:
+    """The 32 bits of each float."""
+    return dr.reinterpret_array(be.plain.UInt32, value)
 
 
 def power_of_two(n: int) -> int:

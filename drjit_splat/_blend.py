@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from . import constants as c
-from ._backend import PIXELS, TILE, Backend, packet, power_of_two
+from ._backend import PIXELS, TILE, Backend, bits_of, packet, power_of_two, write
 from ._inputs import Settings
 from ._lists import TileLists, lane_order
 from ._project import RECORD
@@ -91,12 +91,11 @@ def raw_alphas(geometry: list[Any], dx: Any, dy: Any, recurrence: bool) -> list[
     return values
 
 
-def all_done(J: Any, transmittances: list[Any]) -> Any:
+def all_done(be: Backend, transmittances: list[Any]) -> Any:
     """Whether every pixel of the tile has stopped; a stopped pixel carries its transmittance negated."""
-    signs = [dr.reinterpret_array(J.UInt32, t) for t in transmittances]
-    combined = signs[0]
-    for sign in signs[1:]:
-        combined &= sign
+    combined = bits_of(be, transmittances[0])
+    for transmittance in transmittances[1:]:
+        combined &= bits_of(be, transmittance)
     return combined >= 0x80000000
 
 
@@ -145,18 +144,18 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     start = [dr.select(inside, J.Float(1.0), J.Float(-1.0)) for _, inside in pixels]
     k, transmittances, sums = dr.while_loop(
         (tile.first, start, [J.Float(0) for _ in range(PIXELS * features)]),
-        lambda k, transmittances, sums: (k < tile.last) & ~all_done(J, transmittances),
+        lambda k, transmittances, sums: (k < tile.last) & ~all_done(be, transmittances),
         body,
         mode="symbolic",
     )
     size = settings.width * settings.height
     image, left = dr.empty(J.Float, size * features), dr.empty(J.Float, size)
     for p, (index, inside) in enumerate(pixels):
-        dr.scatter(left, dr.abs(transmittances[p]), index, inside)
+        write(left, dr.abs(transmittances[p]), index, inside)
         for f in range(features):
-            dr.scatter(image, sums[p * features + f], index * features + f, inside)
+            write(image, sums[p * features + f], index * features + f, inside)
     end = dr.empty(J.UInt32, lists.tiles)
-    dr.scatter(end, k, tile.index)
+    write(end, k, tile.index)
     dr.eval(image, left, end)
     i = dr.arange(J.UInt32, lists.tiles)
     return Blended(image, left, end, lane_order(be, end - dr.gather(J.UInt32, lists.start, i), lists.tiles))

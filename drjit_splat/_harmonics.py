@@ -1,4 +1,4 @@
-"""Real spherical harmonics in plain torch, so that autograd differentiates them (the 3DGS sign and order convention)."""
+"""Real spherical harmonics in plain torch, differentiated by autograd (3DGS signs and order)."""
 
 from __future__ import annotations
 

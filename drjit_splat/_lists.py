@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from . import constants as c
-from ._backend import TILE, Backend, larger, packet, power_of_two, smaller
+from ._backend import TILE, Backend, bits_of, packet, power_of_two, smaller, write
 from ._inputs import Settings
 from ._project import Footprint, Projected
 
@@ -48,14 +48,13 @@ def _sorted_by(be: Backend, keys: Any, bits: int) -> Any:
 def depth_order(be: Backend, projected: Projected) -> Any:
     """Splat ids by increasing depth, ties by id, culled splats last; exact for every range of depths."""
     J = be.plain
-    bits = dr.reinterpret_array(J.UInt32, projected.depths)
-    low = dr.min(dr.select(projected.visible, bits, 0xFFFFFFFF))
-    high = dr.max(dr.select(projected.visible, bits, 0))
-    dr.eval(low, high)
     # Positive floats order like their bits, so subtracting the smallest keeps the order and shortens the key.
-    span = int(high[0]) - int(low[0])
+    bits = bits_of(be, projected.depths)
+    low: Any = dr.min(dr.select(projected.visible, bits, J.UInt32(0xFFFFFFFF)))
+    high: Any = dr.max(dr.select(projected.visible, bits, J.UInt32(0)))
+    dr.eval(low, high)
     keys = dr.select(projected.visible, bits, high) - low
-    return _sorted_by(be, keys, span.bit_length())
+    return _sorted_by(be, keys, (int(high[0]) - int(low[0])).bit_length())
 
 
 def check_pairs(pairs: int, be: Backend) -> None:
@@ -84,10 +83,10 @@ def _emit(
 
     def body(k: Any, row: Any, column: Any, last: Any) -> tuple[Any, ...]:
         # A count that disagreed with the spans could only send entries to the unused tile, never out of bounds.
-        write = (column <= last) | (row > foot.last)
-        dr.scatter(tile, dr.select(row <= foot.last, J.UInt32(row) * columns + J.UInt32(column), outside), k, write)
-        dr.scatter(splat, order, k, write)
-        k = dr.select(write, k + 1, k)
+        emits = (column <= last) | (row > foot.last)
+        write(tile, dr.select(row <= foot.last, J.UInt32(row) * columns + J.UInt32(column), outside), k, emits)
+        write(splat, order, k, emits)
+        k = dr.select(emits, k + 1, k)
         next_row = column >= last
         row = dr.select(next_row, row + 1.0, row)
         first_column, last_column = foot.columns(row, image_width)

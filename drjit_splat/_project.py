@@ -10,7 +10,7 @@ import drjit as dr
 import torch
 
 from . import constants as c
-from ._backend import TILE, Backend, flat, larger, packet, power_of_two, smaller, write_packet
+from ._backend import TILE, Backend, bits_of, flat, larger, packet, power_of_two, smaller, write, write_packet
 from ._inputs import Settings
 
 LOG2E = math.log2(math.e)
@@ -115,7 +115,7 @@ def project(
     minors = [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     sharp = minors[0] * minors[0] + minors[1] * minors[1] + minors[2] * minors[2]
     determinant = sharp + cam.eps2d * (xx + yy) + cam.eps2d * cam.eps2d
-    invertible = determinant > c.DET_MIN
+    invertible = (determinant > c.DET_MIN) & (determinant < c.DET_MAX)
     determinant = dr.select(invertible, determinant, 1.0)
     if antialiased:
         opacity = opacity * dr.sqrt(larger(sharp / determinant, c.COMPENSATION_MIN))
@@ -217,13 +217,13 @@ class Projected:
     nonfinite: bool
 
 
-def _finite(J: Any, values: list[Any]) -> Any:
+def _finite(be: Backend, values: list[Any]) -> Any:
     """Whether every value is finite, by its bits: fast-math comparisons may assume that NaNs do not occur."""
     exponent = 0x7F800000
-    worst = J.Bool(True)
+    finite = be.plain.Bool(True)
     for value in values:
-        worst &= (dr.reinterpret_array(J.UInt32, value) & exponent) != exponent
-    return worst
+        finite &= (bits_of(be, value) & exponent) != exponent
+    return finite
 
 
 def run(
@@ -242,7 +242,7 @@ def run(
     opacity = dr.gather(J.Float, sources[3], i)
     columns = inputs[4].shape[1]
     colors = [dr.gather(J.Float, sources[4], columns * i + j) for j in range(columns)]
-    finite = _finite(J, [*mean, *quat, *scale, opacity, *colors])
+    finite = _finite(be, [*mean, *quat, *scale, opacity, *colors])
 
     e = project(mean, quat, scale, opacity, cam, settings.antialiased)
     geometry = e.geometry()
@@ -271,8 +271,8 @@ def run(
         be, footprints, [foot.x, foot.y, foot.slope, foot.reach, foot.width2, foot.turn, foot.first, foot.last], i
     )
     radii = dr.empty(J.Int32, 2 * n)
-    dr.scatter(radii, dr.select(visible, J.Int32(radius_x), 0), 2 * i)
-    dr.scatter(radii, dr.select(visible, J.Int32(radius_y), 0), 2 * i + 1)
+    write(radii, dr.select(visible, J.Int32(radius_x), 0), 2 * i)
+    write(radii, dr.select(visible, J.Int32(radius_y), 0), 2 * i + 1)
     tally = dr.zeros(J.UInt64, 8)
     dr.scatter_add(tally, J.UInt64(counts), J.UInt32(7), mode=be.scatter_mode)
     dr.scatter_add(tally, J.UInt64(1), dr.select(finite, reason, 6), mode=be.scatter_mode)

@@ -22,6 +22,9 @@ DET_MIN = 1e-12
 """Smallest determinant (pixels^4) of a projected covariance that can be inverted in float32. With the default
 eps2d every determinant is >= 0.09, so this only culls splats when the low-pass is switched off."""
 
+DET_MAX = 1e30
+"""Largest such determinant: beyond it (a splat 10 million pixels wide) float32 products overflow."""
+
 COMPENSATION_MIN = 1e-10
 """Floor of the determinant ratio under the antialiasing square root, whose slope is infinite at zero. At the floor
 an opacity is multiplied by 1e-5 and the splat is culled, so no visible splat is changed by it."""

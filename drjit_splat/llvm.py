@@ -60,7 +60,7 @@ def candidates() -> list[tuple[int | None, Path]]:
 
 def _install_hint() -> str:
     package = {
-        "linux": "`apt-get install libllvm19` (Fedora: `dnf install llvm-libs`, conda: `conda install -c conda-forge llvmlite libllvm19`)",
+        "linux": "`apt-get install libllvm19` (Fedora: `dnf install llvm-libs`; conda-forge: `libllvm19`)",
         "darwin": "`brew install llvm`",
         "win32": "`winget install LLVM.LLVM`",
     }.get(sys.platform, "LLVM 19 from your package manager")

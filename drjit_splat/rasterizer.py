@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ._function import Splat, Trace
 from ._harmonics import colors_seen_from
-from ._inputs import Settings, Splats, check_shapes, finish
+from ._inputs import Settings, Splats, check_finite, check_shapes, finish
 from ._project import CULLED, RECORD
 
 
@@ -69,6 +69,8 @@ def rasterization(
     )
     given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
     check_shapes(given, settings)
+    if sh_degree is not None or not settings.has_colors:
+        check_finite(colors=colors)  # the projection kernel checks everything that it reads itself
     single = Splats(*(None if t is None else t.to(torch.float32) for t in vars(given).values()))  # type: ignore[arg-type]
     images, coverages, traces = [], [], []
     for i in range(len(viewmats)):

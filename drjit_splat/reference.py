@@ -84,7 +84,7 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
     sharp = (torch.linalg.cross(half[:, 0], half[:, 1]) ** 2).sum(-1)
     determinant = sharp + s.eps2d * (xx + yy) + s.eps2d**2
     covariance = torch.stack([xx + s.eps2d, xy, yy + s.eps2d], -1)
-    invertible = determinant > c.DET_MIN
+    invertible = (determinant > c.DET_MIN) & (determinant < c.DET_MAX)
     determinant = torch.where(invertible, determinant, torch.ones_like(determinant))
     opacities = splats.opacities
     if s.antialiased:
@@ -93,8 +93,8 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
     bright = opacities.detach() >= c.ALPHA_MIN
     reach2 = 2 * torch.log(opacities.detach().clamp_min(c.ALPHA_MIN) / c.ALPHA_MIN)
     extent = (reach2[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
-    size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
-    on_screen = ((means2d + extent > 0.5) & (means2d - extent < size - 0.5)).all(-1)
+    image_size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
+    on_screen = ((means2d + extent > 0.5) & (means2d - extent < image_size - 0.5)).all(-1)
     visible = in_range & invertible & bright & on_screen & (extent.ceil() > s.radius_clip).any(-1)
     radii = torch.where(visible[:, None], extent.ceil(), torch.zeros_like(extent)).to(torch.int32)
     return Projection(means2d, depths, covariance, determinant, opacities, visible.detach(), radii)
@@ -186,8 +186,8 @@ def rasterization(
         decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
 
     Returns:
-        colors [C, H, W, D], alphas [C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii`, `visible` (as the
-        fast path), `decisions` (one per camera) and `margin` [C, H, W]: how close, relatively, the pixel's closest
+        colors [C, H, W, D], alphas [C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii`, `visible` (as in
+        the fast path), `decisions` (one per camera) and `margin` [C, H, W]: how close, relatively, the pixel's closest
         threshold is; compare images and gradients only where it exceeds the rounding error of the tested code.
 
     Raises:
