@@ -1,0 +1,192 @@
+"""The avatar: canonical Gaussians bound to a head model, and the file it is kept in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from uika.errors import UikaError
+from uika.files import replacing
+from uika.head import HeadModel, HeadParameters, pose_gaussians, pose_vertices, shaped_vertices
+
+FORMAT = "uika-avatar"
+VERSION = "1"
+
+
+class AvatarError(UikaError):
+    """An avatar, or its file, that cannot be used; the message says which and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Avatar:
+    """M Gaussians on the neutral, unposed head of one person; tensors are float32 on the CPU unless noted.
+
+    The canonical surface is the head with this identity and static offset, zero pose and expression.
+    """
+
+    head_id: str
+    identity: Tensor  # [K] standard deviations
+    static_offset: Tensor  # [V,3] metres, added to the head's template (hair, mostly)
+    means: Tensor  # [M,3] metres
+    quats: Tensor  # [M,4] wxyz
+    scales: Tensor  # [M,3] metres, standard deviations
+    opacities: Tensor  # [M] in [0,1]
+    colors: Tensor  # [M,3] sRGB in [0,1]
+    triangle: Tensor  # [M] int64, triangle that carries each Gaussian
+    barycentric: Tensor  # [M,3] its surface point
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes, types and values.
+
+        Raises:
+            AvatarError: a tensor does not fit; the message names it.
+        """
+        count, vertices = len(self.means), len(self.static_offset)
+        shapes: dict[str, tuple[int, ...]] = {
+            "identity": (self.identity.numel(),),
+            "static_offset": (vertices, 3),
+            "means": (count, 3),
+            "quats": (count, 4),
+            "scales": (count, 3),
+            "opacities": (count,),
+            "colors": (count, 3),
+            "triangle": (count,),
+            "barycentric": (count, 3),
+        }
+        for name, shape in shapes.items():
+            tensor = getattr(self, name)
+            dtype = torch.int64 if name == "triangle" else torch.float32
+            if tuple(tensor.shape) != shape or tensor.dtype != dtype:
+                raise AvatarError(
+                    f"avatar tensor '{name}' is {tensor.dtype} {list(tensor.shape)}, not {dtype} {list(shape)}"
+                )
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                raise AvatarError(f"avatar tensor '{name}' holds values that are not finite")
+        if count == 0:
+            raise AvatarError("avatar has no Gaussians")
+        if bool((self.scales < 0).any()) or bool((self.triangle < 0).any()):
+            raise AvatarError("avatar tensors 'scales' and 'triangle' must not hold negative values")
+        if bool((self.opacities < 0).any()) or bool((self.opacities > 1).any()):
+            raise AvatarError("avatar tensor 'opacities' must lie between 0 and 1")
+
+    def __len__(self) -> int:
+        """The number of Gaussians."""
+        return len(self.means)
+
+    def save(self, path: str | Path) -> None:
+        """Write a safetensors file; it appears under its name only when it is complete."""
+        from safetensors.torch import save_file
+
+        tensors = {name: getattr(self, name).contiguous() for name in _TENSORS}
+        metadata = {
+            "format": FORMAT,
+            "version": VERSION,
+            "head_id": self.head_id,
+            "provenance": json.dumps(dict(self.provenance), sort_keys=True),
+        }
+        with replacing(path) as temporary:
+            save_file(tensors, temporary, metadata=metadata)
+
+    @staticmethod
+    def load(path: str | Path) -> Avatar:
+        """Read a file written by `save`.
+
+        Raises:
+            AvatarError: no such file, not an avatar, another format version, truncated, or with wrong content; one
+                sentence that names the file.
+        """
+        source = Path(path)
+        if not source.is_file():
+            reason = "is a directory, not an avatar file" if source.is_dir() else "no such avatar file"
+            raise AvatarError(f"{source}: {reason}; `uika reconstruct` makes one from photos")
+        head_id, provenance, tensors = _read(source)
+        try:
+            return Avatar(head_id=head_id, provenance=provenance, **tensors)
+        except AvatarError as error:
+            raise AvatarError(f"{source}: {error}") from error
+
+    def check_head(self, head: HeadModel) -> None:
+        """Make sure that `head` is the head model that this avatar was made for.
+
+        Raises:
+            AvatarError: it is another one.
+        """
+        if head.id != self.head_id:
+            raise AvatarError(
+                f"the avatar was made for the head model '{self.head_id}', but '{head.id}' is loaded; "
+                "set UIKA_HEAD to its file or make the avatar again"
+            )
+        for name, own, other in (
+            ("identity coefficients", len(self.identity), len(head.identity_basis)),
+            ("vertices", len(self.static_offset), len(head.template)),
+        ):
+            if own != other:
+                raise AvatarError(f"the avatar has {own} {name}, but the head model '{head.id}' has {other}")
+        if int(self.triangle.max()) >= len(head.faces):
+            raise AvatarError(f"the avatar is bound to triangles that the head model '{head.id}' does not have")
+
+    def canonical_vertices(self, head: HeadModel) -> Tensor:
+        """The mesh [V,3] in metres that the Gaussians were placed on."""
+        self.check_head(head)
+        neutral = HeadParameters.zeros(head, dtype=head.template.dtype).replace(identity=self.identity)
+        return shaped_vertices(head, neutral, self.static_offset)
+
+    def pose(
+        self, params: HeadParameters, head: HeadModel, canonical: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Move the Gaussians with the head.
+
+        Args:
+            params: expression and pose, batch [...]; the identity in it is ignored, the avatar keeps its own.
+            head: the head model that the avatar was made for.
+            canonical: [V,3] the result of `canonical_vertices`, to save time over many frames.
+
+        Returns:
+            Means [...,M,3], quats [...,M,4] and scales [...,M,3].
+
+        Raises:
+            AvatarError: the head model is another one.
+        """
+        rest = self.canonical_vertices(head) if canonical is None else canonical
+        posed = pose_vertices(head, params.replace(identity=self.identity), self.static_offset)
+        return pose_gaussians(
+            self.means, self.quats, self.scales, rest, posed, head.faces, self.triangle, self.barycentric
+        )
+
+
+_TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance"))
+
+
+def _read(path: Path) -> tuple[str, dict[str, str], dict[str, Tensor]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise AvatarError(f"{path}: is not an avatar file; `uika reconstruct` makes one from photos")
+            if metadata.get("version") != VERSION:
+                found = metadata.get("version", "unknown")
+                raise AvatarError(
+                    f"{path}: is of avatar format version {found}, but this program reads version {VERSION}; "
+                    "make the avatar again"
+                )
+            names = set(file.keys())
+            if names != set(_TENSORS):
+                odd = ", ".join(sorted(names ^ set(_TENSORS))[:5])
+                raise AvatarError(f"{path}: has missing or unknown tensors ({odd}); make the avatar again")
+            provenance = json.loads(metadata["provenance"])
+            if not isinstance(provenance, dict):
+                raise AvatarError(f"{path}: has an unreadable provenance entry; make the avatar again")
+            tensors = {name: file.get_tensor(name) for name in _TENSORS}
+            return metadata["head_id"], {str(key): str(value) for key, value in provenance.items()}, tensors
+    except SafetensorError as error:
+        raise AvatarError(f"{path}: is truncated, damaged or not an avatar file ({error})") from error
+    except (KeyError, json.JSONDecodeError) as error:
+        raise AvatarError(f"{path}: has an incomplete header ({error}); make the avatar again") from error

@@ -1,0 +1,29 @@
+"""The base of the errors that tell a user what to change, and which extra brings a missing package."""
+
+from __future__ import annotations
+
+# Import name of each optional package -> the extra of this project that installs it.
+EXTRAS = {
+    "av": "cli",
+    "PIL": "cli",
+    "tqdm": "cli",
+    "tyro": "cli",
+    "mediapipe": "photo",
+    "pillow_heif": "photo",
+    "pymatting": "photo",
+    "scipy": "photo",
+    "mitsuba": "scenes",
+    "OpenEXR": "scenes",
+    "trimesh": "scenes",
+    "viser": "view",
+}
+
+
+class UikaError(ValueError):
+    """Input that cannot be used; the message is one sentence that names the argument or file and says what to do."""
+
+
+def install_command(module: str) -> str | None:
+    """The pip command that brings the package imported as `module`; None when no extra of this project does."""
+    extra = EXTRAS.get(module.partition(".")[0])
+    return None if extra is None else f'pip install "uika-drjit[{extra}]"'
