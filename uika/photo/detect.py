@@ -14,9 +14,10 @@ MESH_SIDE = 512
 FACE_MARGIN = 2.0  # side of the crop given to the face mesh, in face sizes
 # Crops of the second pass: (scale, shift x, shift y) relative to the margin above. Their mean is steadier than any one.
 PASSES = ((1.0, 0.0, 0.0), (0.85, 0.03, 0.0), (1.2, -0.03, 0.03))
-# Root mean square disagreement of those crops, in face sizes, above which it is no face: photographed faces stay below
-# 0.014, the wheels and dials that the detector takes for faces lie at 0.06 and more.
-MAX_SPREAD = 0.03
+# Mean distance of any pass from their mean, in face sizes, above which it is no face: real faces stay below 0.02,
+# the wheels and lamps that the detector takes for faces lie above 0.05.
+MAX_SPREAD = 0.035
+MIN_FACE = 24  # pixels
 
 
 def find_face(photo: NDArray[np.uint8]) -> NDArray[np.float64] | None:
@@ -84,8 +85,9 @@ def _refine(photo: NDArray[np.uint8], face: Square) -> NDArray[np.float64] | Non
     if len(found) < 2:
         return None
     mean = found.mean(axis=0)
-    spread = np.sqrt(np.square(found - mean).sum(axis=-1).mean()) / np.ptp(mean, axis=0).max()
-    return mean if spread < MAX_SPREAD else None
+    size = np.ptp(mean, axis=0).max()
+    spread = np.linalg.norm(np.stack([first, *found]) - mean, axis=-1).mean(axis=-1).max()
+    return mean if size > MIN_FACE and spread < MAX_SPREAD * size else None
 
 
 def _meshes(photo: NDArray[np.uint8], squares: list[Square]) -> list[NDArray[np.float64] | None]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from uika.photo import matte
 from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
-from uika.photo.detect import find_face
+from uika.photo.detect import MIN_FACE, find_face
 from uika.photo.error import PhotoError
 from uika.photo.nets import person_mask
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
@@ -61,7 +61,9 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
     rgb = _opaque(picture, background)
     face = find_face(rgb)
     if face is None:
-        raise PhotoError(path, "shows no face that can be found; use an upright photo with the whole face in view")
+        raise PhotoError(
+            path, f"shows no face of {MIN_FACE} px or more; use an upright photo with the whole face in view"
+        )
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
     crop = resample(rgb, square, size)
