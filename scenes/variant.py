@@ -1,0 +1,42 @@
+"""Starting Mitsuba on the best variant that this machine can run."""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+from types import ModuleType
+
+from drjit_splat import llvm
+
+FAST_VARIANT = "llvm_ad_rgb"
+PLAIN_VARIANT = "scalar_rgb"
+
+
+@lru_cache(maxsize=1)
+def _choose() -> tuple[str, str]:
+    """The variant to use and, for the plain one, why the fast one cannot run."""
+    try:
+        llvm.require()
+    except RuntimeError as error:
+        return PLAIN_VARIANT, str(error)
+    return FAST_VARIANT, ""
+
+
+def load_mitsuba() -> ModuleType:
+    """Import Mitsuba with `llvm_ad_rgb` selected, or `scalar_rgb` with a warning where LLVM is missing.
+
+    Raises:
+        ImportError: Mitsuba is not installed.
+    """
+    variant, reason = _choose()
+    try:
+        import mitsuba
+    except ImportError as error:
+        raise ImportError(
+            "reference renders need Mitsuba: install the extra with `pip install uika-drjit[scenes]`"
+        ) from error
+    if mitsuba.variant() != variant:
+        mitsuba.set_variant(variant)
+        if reason:
+            warnings.warn(f"Mitsuba runs on {variant}, without depth, uv and triangle images: {reason}", stacklevel=2)
+    return mitsuba
