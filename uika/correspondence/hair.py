@@ -21,7 +21,7 @@ ROUNDS = 8
 ANGLES = 180  # directions around the head in which the outline is compared
 OUTLINE_SHARE = 0.985  # vertices this close to the outline, relative to its radius, belong to it
 RADII = 192
-BENDING, TENSION = 30.0, 0.05  # smoothness of the offset field against the outline's pull
+BENDING, TENSION = 10.0, 0.05  # smoothness of the offset field against the outline's pull
 BACK_PULL = 1e-3
 FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
@@ -39,19 +39,22 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
 
     Args:
         head: the head model.
-        parameters: [N] fitted parameters, one identity.
+        parameters: [N] fitted parameters, one identity, joints at rest.
         cameras: [N] fitted cameras.
         mattes: [N,S,S] head and hair without shoulders, in [0,1].
     """
     edges = _edges(head)
     region = _region(head, edges)
-    reach = torch.stack([_reach(matte, at[0]) for matte, at in zip(mattes, _centres(head, parameters, cameras), strict=True)])
+    reach = torch.stack(
+        [_reach(matte, at[0]) for matte, at in zip(mattes, _centres(head, parameters, cameras), strict=True)]
+    )
     canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
     normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
     height = torch.zeros(len(head.template))
+    bald = pose_vertices(head, parameters)
     for _ in range(ROUNDS):
-        vertices = pose_vertices(head, parameters, height[:, None] * normals)
-        wanted, pull = _outline_demand(head, vertices, cameras, reach, region)
+        # The cameras carry the pose, so the offset simply adds to the posed head.
+        wanted, pull = _outline_demand(head, bald + height[:, None] * normals, cameras, reach, region)
         height = _membrane(region, height, wanted, pull)
     return height[:, None] * normals
 
@@ -133,7 +136,9 @@ def _outline_demand(
     sector = (torch.atan2(ray[..., 1], ray[..., 0]) % (2 * torch.pi) / (2 * torch.pi) * ANGLES).long() % ANGLES
     skin = head.masks["mouth_inner"] + head.masks["eyeballs"] < 0.5
     outline = torch.zeros(len(pixels), ANGLES).scatter_reduce(1, sector, radius * skin, "amax")
-    spread = torch.nn.functional.max_pool1d(torch.cat((outline[:, -1:], outline, outline[:, :1]), 1)[:, None], 3, 1)[:, 0]
+    spread = torch.nn.functional.max_pool1d(torch.cat((outline[:, -1:], outline, outline[:, :1]), 1)[:, None], 3, 1)[
+        :, 0
+    ]
     gap = reach.gather(1, sector) - radius
     outward = (normals[..., :2] * ray / radius[..., None]).sum(-1)
     at = (radius > OUTLINE_SHARE * spread.gather(1, sector)) & (outward > 0.3) & gap.isfinite()

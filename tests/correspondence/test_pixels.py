@@ -1,0 +1,93 @@
+"""Hair silhouettes and pixel-wise correspondence of fitted heads."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from uika.correspondence import Fit, pixel_uv
+from uika.correspondence.hair import MAX_OFFSET, fit_hair
+from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project, rasterize
+from uika.head import vertex_normals as normals_of
+
+SIZE = 256
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+def covered(head: HeadModel, vertices: Tensor, camera: Camera) -> Tensor:
+    points, depth = project(vertices, camera)
+    return rasterize(points, head.faces, camera.height, camera.width, depth=depth, cull="none")[0] >= 0
+
+
+def fitted(head: HeadModel, camera: Camera, offset: Tensor | None = None) -> Fit:
+    offset = torch.zeros_like(head.template) if offset is None else offset
+    return Fit(HeadParameters.zeros(head, 1), Camera.stack([camera]), offset, torch.zeros(1))
+
+
+@pytest.mark.parametrize("yaws", [[0.0], [0.0, 60.0, -60.0]])
+def test_hair_meets_the_matte_in_every_photo(head: HeadModel, yaws: list[float]) -> None:
+    lift = 0.03 * head.masks["scalp"][:, None] * torch.nn.functional.normalize(head.template, dim=-1)
+    truth = head.template + lift
+    cameras = Camera.stack([look_at(yaw, 0.0, 1.0, fov_y=22.0, size=SIZE) for yaw in yaws])
+    mattes = torch.stack([covered(head, truth, cameras[n]) for n in range(len(yaws))])
+    offset = fit_hair(head, HeadParameters.zeros(head, len(yaws)), cameras, mattes.float())
+    for n in range(len(yaws)):
+        got = covered(head, head.template + offset, cameras[n])
+        bald = covered(head, head.template, cameras[n])
+        overlap = (got & mattes[n]).sum() / (got | mattes[n]).sum()
+        assert overlap > 0.95
+        assert overlap > (bald & mattes[n]).sum() / (bald | mattes[n]).sum() + 0.03
+
+
+def test_hair_leaves_the_face_alone_and_stays_bounded(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, fov_y=30.0, size=SIZE)
+    everything = torch.ones(1, SIZE, SIZE)
+    everything[:, :8] = everything[:, -8:] = 0.0
+    everything[..., :8] = everything[..., -8:] = 0.0
+    offset = fit_hair(head, HeadParameters.zeros(head, 1), Camera.stack([camera]), everything)
+    assert offset.isfinite().all()
+    assert offset.norm(dim=-1).max() <= MAX_OFFSET + 1e-6
+    assert offset[head.masks["face"] > 0.99].abs().max() == 0.0
+
+
+def test_a_bald_matte_asks_for_no_hair(head: HeadModel) -> None:
+    camera = Camera.stack([look_at(0.0, 0.0, 1.0, fov_y=22.0, size=SIZE)])
+    matte = covered(head, head.template, camera[0])[None].float()
+    assert fit_hair(head, HeadParameters.zeros(head, 1), camera, matte).norm(dim=-1).max() < 0.006
+
+
+def test_pixel_uv_is_the_uv_of_the_surface_point(head: HeadModel) -> None:
+    camera = look_at(20.0, 5.0, 1.0, fov_y=22.0, size=SIZE)
+    uv, valid, weight = pixel_uv(fitted(head, camera), head, torch.ones(1, SIZE, SIZE))
+    assert valid[0].float().mean() > 0.15
+    assert ((weight > 0) == valid).all()
+    assert float(uv.min()) >= 0 and float(uv.max()) <= 1
+    # Face vertices that look at the camera: the pixel under each shows almost its own UV.
+    normals = torch.nn.functional.normalize(normals_of(head.template, head.faces), dim=-1)
+    facing = (normals * torch.nn.functional.normalize(camera.position - head.template, dim=-1)).sum(-1) > 0.8
+    chosen = torch.nonzero(facing & (head.masks["face"] > 0.9) & (head.masks["eyes"] < 0.1)).flatten()
+    vertex_uv = torch.zeros(len(head.template), 2)
+    vertex_uv[head.faces.flatten()] = head.uvs[head.uv_faces.flatten()]
+    column, row = project(head.template[chosen], camera)[0].long().T
+    expected = torch.stack((vertex_uv[chosen, 0], 1 - vertex_uv[chosen, 1]), -1)
+    error = (uv[0, row, column] - expected).norm(dim=-1)
+    assert error.median() < 0.006
+
+
+def test_background_and_hidden_pixels_carry_no_weight(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, fov_y=22.0, size=SIZE)
+    matte = torch.zeros(1, SIZE, SIZE)
+    matte[:, : SIZE // 2] = 1.0
+    uv, valid, weight = pixel_uv(fitted(head, camera), head, matte)
+    assert not valid[0, SIZE // 2 :].any()
+    assert weight[0, SIZE // 2 :].max() == 0
+    assert (uv[0, SIZE // 2 :] == 0).all()
+
+
+def test_mattes_of_another_size_are_refused(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, size=SIZE)
+    with pytest.raises(ValueError, match="mattes"):
+        pixel_uv(fitted(head, camera), head, torch.ones(1, SIZE, SIZE // 2))
