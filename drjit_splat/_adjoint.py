@@ -64,13 +64,13 @@ def projection_adjoint(
     outputs = e.geometry()
 
     m = packet(be, moments, i, MOMENTS)
-    _, _, a, b2, c, _ = packet(be, records, i * (RECORD // 8), 8)[:6]
+    _, _, a, h, d, _ = packet(be, records, i * (RECORD // 8), 8)[:6]
     ln2 = math.log(2.0)
     gradients = [
-        ln2 * dr.fma(2.0 * a, m[1], b2 * m[2]),
-        ln2 * dr.fma(2.0 * c, m[2], b2 * m[1]),
+        2 * ln2 * a * m[1],
+        2 * ln2 * dr.fma(a * h, m[1], d * m[2]),
         -ln2 * m[3],
-        -ln2 * m[4],
+        -2 * ln2 * a * m[4],
         -ln2 * m[5],
         ln2 * m[0],
     ]

@@ -56,28 +56,30 @@ def tile_of(be: Backend, index: Any, lists: TileLists, settings: Settings) -> Ti
 
 
 def offsets(be: Backend, tile: Tile, geometry: list[Any]) -> tuple[Any, Any]:
-    """Vector from the splat's mean to the centre of the tile's first pixel."""
-    return be.plain.Float(tile.x) + 0.5 - geometry[0], be.plain.Float(tile.y) + 0.5 - geometry[1]
+    """dx + h dy and dy from the splat's mean to the centre of the tile's first pixel."""
+    dx, dy = be.plain.Float(tile.x) + 0.5 - geometry[0], be.plain.Float(tile.y) + 0.5 - geometry[1]
+    return dr.fma(geometry[3], dy, dx), dy
 
 
-def raw_alphas(geometry: list[Any], dx: Any, dy: Any, recurrence: bool) -> list[Any]:
-    """opacity * exp(-sigma) at the tile's 16 pixels, row by row.
+def raw_alphas(geometry: list[Any], s: Any, t: Any, recurrence: bool) -> list[Any]:
+    """opacity * exp(-sigma) at the tile's 16 pixels, row by row; `s`, `t` as `offsets` gives them.
 
     Along a row and down the first column the Gaussian's ratio of neighbours is itself geometric, so two
     multiplications a pixel replace an exponential.
     """
-    _, _, a, b2, cc, log_opacity = geometry[:6]
+    _, _, a, h, d, log_opacity = geometry[:6]
     if not recurrence:
         values = []
         for k in range(PIXELS):
-            x, y = dx + float(k % TILE), dy + float(k // TILE)
-            quadratic = dr.fma(a * x, x, dr.fma(b2 * x, y, cc * y * y))
-            values.append(dr.exp2(log_opacity - quadratic))
+            row = float(k // TILE)
+            x, y = dr.fma(h, row, s + float(k % TILE)), t + row
+            values.append(dr.exp2(log_opacity - dr.fma(a * x, x, d * y * y)))
         return values
-    corner = dr.exp2(log_opacity - dr.fma(a * dx, dx, dr.fma(b2 * dx, dy, cc * dy * dy)))
-    right = dr.exp2(-dr.fma(a, dr.fma(2.0, dx, 1.0), b2 * dy))
-    down = dr.exp2(-dr.fma(cc, dr.fma(2.0, dy, 1.0), b2 * dx))
-    bend_x, bend_y, twist = dr.exp2(-2.0 * a), dr.exp2(-2.0 * cc), dr.exp2(-b2)
+    ah = a * h
+    corner = dr.exp2(log_opacity - dr.fma(a * s, s, d * t * t))
+    right = dr.exp2(-a * dr.fma(2.0, s, 1.0))
+    down = dr.exp2(-dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)))
+    bend_x, bend_y, twist = dr.exp2(-2.0 * a), dr.exp2(-2.0 * dr.fma(ah, h, d)), dr.exp2(-2.0 * ah)
     values = []
     for row in range(TILE):
         value, ratio = corner, right

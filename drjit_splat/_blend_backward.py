@@ -12,7 +12,7 @@ from ._blend import RECURRENCE_EPS2D, Blended, offsets, raw_alphas, read_feature
 from ._inputs import Settings
 from ._lists import TileLists
 
-MOMENTS = 8  # sums of v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v = alpha dL/dalpha, and 2 spare
+MOMENTS = 8  # sums of v, v s, v t, v s^2, v s t, v t^2 with v = alpha dL/dalpha, s = dx + h dy, t = dy; 2 spare
 
 
 def blend_backward(
@@ -56,8 +56,8 @@ def blend_backward(
         splat = dr.gather(J.UInt32, lists.ids, k)
         geometry = packet(be, records, 2 * splat, 8)
         values = read_features(be, records, splat, features)
-        dx, dy = offsets(be, tile, geometry)
-        alphas = raw_alphas(geometry, dx, dy, recurrence)
+        s, t0 = offsets(be, tile, geometry)
+        alphas = raw_alphas(geometry, s, t0, recurrence)
         transmittances, behind = list(transmittances), list(behind)
         by_value = [J.Float(0) for _ in range(features)]
         total = J.Float(0)
@@ -80,35 +80,38 @@ def blend_backward(
             slopes.append(dr.select(alive & ~clamped, slope, 0.0))
             total += weight
         write = total > 0.0
-        add_packet(be, moments, _moments(J, slopes, dx, dy), splat, write)
+        add_packet(be, moments, _moments(J, slopes, geometry[3], s, t0), splat, write)
         add_packet(be, grad_values, by_value + [J.Float(0)] * (padded - features), splat, write)
         return k + 1, transmittances, behind
 
     dr.while_loop((tile.first, start, behind), lambda k, t, r: k < stop, body, mode="symbolic")
 
 
-def _moments(J: Any, slopes: list[Any], dx: Any, dy: Any) -> list[Any]:
-    """Moments about the splat's mean from those about the tile's first pixel (dx, dy away from the mean)."""
+def _moments(J: Any, slopes: list[Any], h: Any, s: Any, t: Any) -> list[Any]:
+    """Moments in the splat's sheared coordinates (s, t at the tile's first pixel) from those over the 4x4 grid."""
     plain, by_x, by_xx = [], [], []
     for row in range(TILE):
         v = slopes[row * TILE : (row + 1) * TILE]
         plain.append(v[0] + v[1] + v[2] + v[3])
         by_x.append(v[1] + 2.0 * v[2] + 3.0 * v[3])
         by_xx.append(v[1] + 4.0 * v[2] + 9.0 * v[3])
-    s = plain[0] + plain[1] + plain[2] + plain[3]
+    total = plain[0] + plain[1] + plain[2] + plain[3]
     y = plain[1] + 2.0 * plain[2] + 3.0 * plain[3]
     yy = plain[1] + 4.0 * plain[2] + 9.0 * plain[3]
     x = by_x[0] + by_x[1] + by_x[2] + by_x[3]
     xy = by_x[1] + 2.0 * by_x[2] + 3.0 * by_x[3]
     xx = by_xx[0] + by_xx[1] + by_xx[2] + by_xx[3]
-    about_x, about_y = dr.fma(dx, s, x), dr.fma(dy, s, y)
+    # Shear the grid, then move it to the splat's mean.
+    xx = dr.fma(h, dr.fma(h, yy, 2.0 * xy), xx)
+    xy, x = dr.fma(h, yy, xy), dr.fma(h, y, x)
+    about_s, about_t = dr.fma(s, total, x), dr.fma(t, total, y)
     return [
-        s,
-        about_x,
-        about_y,
-        dr.fma(dx, about_x + x, xx),
-        dr.fma(dx, about_y, dr.fma(dy, x, xy)),
-        dr.fma(dy, about_y + y, yy),
+        total,
+        about_s,
+        about_t,
+        dr.fma(s, about_s + x, xx),
+        dr.fma(s, about_t, dr.fma(t, x, xy)),
+        dr.fma(t, about_t + y, yy),
         J.Float(0),
         J.Float(0),
     ]

@@ -48,11 +48,14 @@ class Ellipse:
     invertible: Any
 
     def geometry(self) -> list[Any]:
-        """x, y, A, 2B, C and log2(opacity) of log2(alpha) = log2(opacity) - (A dx^2 + 2B dx dy + C dy^2)."""
-        scale = (0.5 * LOG2E) / self.determinant
+        """x, y, a, h, d and log2(opacity) of log2(alpha) = log2(opacity) - (a (dx + h dy)^2 + d dy^2).
+
+        A sum of squares, unlike the expanded quadratic, cannot turn negative by rounding far along a needle.
+        """
         bright = self.opacity >= c.ALPHA_MIN
         log_opacity = dr.log2(dr.select(bright, self.opacity, 1.0))
-        return [self.x, self.y, scale * self.yy, -2 * scale * self.xy, scale * self.xx, log_opacity]
+        half = 0.5 * LOG2E
+        return [self.x, self.y, half * self.yy / self.determinant, -self.xy / self.yy, half / self.yy, log_opacity]
 
 
 def read_camera(be: Backend, viewmat: torch.Tensor, K: torch.Tensor, settings: Settings) -> Camera:
