@@ -13,13 +13,14 @@ from uika.model import SurfaceTexels
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
 FLATNESS = 0.1  # standard deviation along the normal over the mean tangential one
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
-# Where the atlas is coarser than the relief under it (ears), full-size splats would stick out like feathers.
-_RELIEF = 3.2e-3  # metres on the template
+# sRGB colours under even light of parts that most photos do not show: a mouth that is shut must not open on skin.
+_HIDDEN = {"mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
+_REGIONS = ("eyeballs", "mouth_inner", "teeth")  # labelled 1, 2, 3; skin and hair are 0
 _MIRROR_TOLERANCE = 3e-3  # metres between a mirrored vertex and the vertex it stands for
 
 
 def surface_texels(
-    head: HeadModel, identity: Tensor, static_offset: Tensor, size: int
+    head: HeadModel, identity: Tensor, static_offset: Tensor, size: int, brightness: float = 1.0
 ) -> tuple[SurfaceTexels, Binding]:
     """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas.
 
@@ -31,21 +32,35 @@ def surface_texels(
         identity: [K] standard deviations.
         static_offset: [V,3] metres.
         size: side of the atlas in texels.
+        brightness: light in the photos, a factor on the colours supposed for the inside of the mouth.
 
     Returns:
-        The surface with batch dimension 1 and its mirror map, and the binding of its M texels.
+        The surface with batch dimension 1, its mirror map, regions and supposed colours; and the binding of its M
+        texels.
     """
     binding = uv_texels(head, size)
     neutral = HeadParameters.zeros(head).replace(identity=identity)
     vertices = shaped_vertices(head, neutral, static_offset)
-    frames, sides = _texel_frames(head, vertices, size)
-    _, plain = _texel_frames(head, head.template, size)
-    sides = sides * (_RELIEF / plain.amax(-1, keepdim=True)).clamp_max(1)
-    quats = _quaternions(frames)[binding.triangle]
-    sides = sides[binding.triangle]
-    scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
     points = surface_points(vertices, head.faces, binding)
-    return SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size)), binding
+    frames, sides = _texel_frames(head, vertices, binding, points)
+    scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
+    quats = _quaternions(frames)
+    regions = _regions(head, binding)
+    prior = torch.full((3, size, size), torch.nan)
+    for name, color in _HIDDEN.items():
+        prior[:, regions == _REGIONS.index(name) + 1] = brightness * torch.tensor(color)[:, None]
+    surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions, prior)
+    return surface, binding
+
+
+def _regions(head: HeadModel, binding: Binding) -> Tensor:
+    """Labels [S,S] of the parts whose colours do not mix: place in `_REGIONS` plus one, 0 for the rest."""
+    labels = torch.zeros(len(binding), 1, dtype=torch.int64)
+    for index, name in enumerate(_REGIONS):
+        if name in head.masks:
+            share = (head.masks[name][head.faces[binding.triangle]] * binding.barycentric).sum(1)
+            labels[share > 0.5] = index + 1
+    return binding.to_map(labels)[0]
 
 
 @lru_cache(maxsize=4)
@@ -90,20 +105,48 @@ def _mirrored_corners(head: HeadModel) -> Tensor:
     return result
 
 
-def _texel_frames(head: HeadModel, vertices: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Rotations [F,3,3] along the principal axes of a texel's footprint, and its two sides [F,2] in metres."""
+def _texel_frames(head: HeadModel, vertices: Tensor, binding: Binding, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations [M,3,3] along the principal axes of each texel's footprint, and its two sides [M,2] in metres.
+
+    Steps to the neighbouring texels follow the surface where the atlas is coarser than its relief (ears); the
+    triangle's own derivative stands in where a texel has no neighbours.
+    """
     frames, _ = surface_frames(vertices, head.faces)
     corners, uvs = vertices[head.faces], head.uvs[head.uv_faces]
-    edges = frames[..., :2].mT @ (corners[:, 1:] - corners[:, :1]).mT  # [F,2,2], in the plane of the triangle
-    steps = (uvs[:, 1:] - uvs[:, :1]).mT * size
-    determinant = torch.linalg.det(steps)
-    sound = determinant.abs() > 1e-9
-    inverse = torch.linalg.inv(torch.where(sound[:, None, None], steps, torch.eye(2)))
-    axes, sides, _ = torch.linalg.svd(edges @ inverse)
-    first = (frames[..., :2] @ axes[..., :1])[..., 0]
-    normal = frames[..., 2]
-    turned = torch.stack((first, torch.linalg.cross(normal, first), normal), -1)
-    return turned, sides.clamp(*_SIZE_RANGE)
+    edges = (corners[:, 1:] - corners[:, :1]).mT  # [F,3,2]
+    texels = (uvs[:, 1:] - uvs[:, :1]).mT * uvs.new_tensor([[1.0], [-1.0]]) * binding.size
+    sound = torch.linalg.det(texels).abs() > 1e-9
+    slopes = edges @ torch.linalg.inv(torch.where(sound[:, None, None], texels, torch.eye(2)))
+    slope = slopes[binding.triangle]
+    place = binding.to_map(points, fill=torch.nan)
+    across = _step(place, binding, 2, slope[..., 0])
+    down = _step(place, binding, 1, slope[..., 1])
+    angle = 0.5 * torch.atan2(2 * (across * down).sum(-1), (across**2 - down**2).sum(-1))[:, None]
+    first = torch.cos(angle) * across + torch.sin(angle) * down
+    second = torch.cos(angle) * down - torch.sin(angle) * across
+    sides = torch.stack((first.norm(dim=-1), second.norm(dim=-1)), -1)
+    normal = frames[binding.triangle][..., 2]
+    tangent = _unit(torch.where(sides[:, :1] > 1e-9, first, frames[binding.triangle][..., 0]))
+    outward = torch.linalg.cross(first, second)
+    upright = (outward * normal).sum(-1, keepdim=True)
+    # Where the steps span no plane, or fold over, the triangle's normal is the better one.
+    outward = torch.where(upright.abs() > 0.2 * outward.norm(dim=-1, keepdim=True), outward * upright.sign(), normal)
+    outward = _unit(outward - (outward * tangent).sum(-1, keepdim=True) * tangent)
+    return torch.stack((tangent, torch.linalg.cross(outward, tangent), outward), -1), sides.clamp(*_SIZE_RANGE)
+
+
+def _step(place: Tensor, binding: Binding, axis: int, slope: Tensor) -> Tensor:
+    """Mean step [M,3] from a texel to its neighbours along an axis of the map [3,S,S]; `slope` where it has none."""
+    forward = torch.full_like(place, torch.nan)
+    size = place.shape[axis]
+    forward.narrow(axis, 0, size - 1).copy_(place.diff(dim=axis))
+    backward = forward.roll(1, axis)
+    step = binding.from_map(torch.nanmean(torch.stack((forward, backward)), 0))
+    return torch.where(torch.isfinite(step), step, slope)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-20)
 
 
 def _quaternions(rotation: Tensor) -> Tensor:

@@ -1,0 +1,163 @@
+"""The whole way from photos to an avatar."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from uika._version import __version__
+from uika.avatar import Avatar
+from uika.errors import UikaError
+from uika.head import HeadModel, load_head
+
+if TYPE_CHECKING:
+    from uika.correspondence import Fit
+    from uika.model import Reconstructor, SurfaceTexels
+    from uika.photo import Photo
+
+MAX_PHOTOS = 64
+_UNTRAINED_OPACITY = 0.95
+_MID_FACE = 0.55  # sRGB level of skin in even light, for judging how bright the photos are
+
+
+@dataclass(frozen=True)
+class Report:
+    """What happened on the way: seconds of each stage and counts of what was skipped or filled in."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a block."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """An avatar and what it was made from; photos and fit are in the order of the files' content hashes."""
+
+    avatar: Avatar
+    photos: tuple[Photo, ...]
+    fit: Fit
+    report: Report
+
+
+def reconstruct(
+    photos: Sequence[str | Path],
+    head: HeadModel | None = None,
+    model: str | Path = "tiny",
+    *,
+    report: Report | None = None,
+) -> Reconstruction:
+    """Make an avatar from photos of one person.
+
+    The order of the photos does not matter.
+
+    Args:
+        photos: 1 to 64 photo files, each showing the face.
+        head: the head model; None loads the one that `uika.head.load_head` finds.
+        model: "tiny", the built-in network, which without training keeps the photos' colours on the fitted surface;
+            "none", the same without running a network; or the path of a trained model (.safetensors).
+        report: filled while the stages pass; None makes a new one.
+
+    Raises:
+        PhotoError: a photo cannot be read or shows no face; the message names it.
+        UikaError: there are no photos or too many.
+        ValueError: the model's name or file cannot be used.
+    """
+    if not 1 <= len(photos) <= MAX_PHOTOS:
+        raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
+    from uika.correspondence import fit_photos, pixel_uv
+    from uika.photo import head_matte, prepare
+    from uika.surface import surface_texels
+
+    report = Report() if report is None else report
+    with report.stage("model"):
+        network, name = _network(model)
+        head = load_head() if head is None else head
+    with report.stage("photos"):
+        prepared = sorted((prepare(path) for path in photos), key=lambda photo: photo.sha256)
+        hair = [head_matte(photo) for photo in prepared]
+    with report.stage("fit"):
+        fit = fit_photos(prepared, head, hair)
+    with report.stage("correspondence"):
+        images = torch.stack([photo.image for photo in prepared])
+        mattes = torch.stack([photo.matte for photo in prepared])
+        uv, valid, weight = pixel_uv(fit, head, mattes)
+        uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
+    with report.stage("reconstruction"), torch.no_grad():
+        identity = fit.parameters.identity[0]
+        brightness = _brightness(images, valid, weight)
+        surface, binding = surface_texels(head, identity, fit.static_offset, network.config.map_size, brightness)
+        inputs = (images[None], mattes[None, :, None], uv[None], weight[None, :, None], binding.texel, surface)
+        means, quats, scales, opacities, colors, counts = _gaussians(network, inputs, run=model != "none")
+    report.counts.update(counts)
+    avatar = Avatar(
+        head_id=head.id,
+        identity=identity.clone(),
+        static_offset=fit.static_offset,
+        means=means[0],
+        quats=quats[0],
+        scales=scales[0],
+        opacities=opacities[0],
+        colors=colors[0].clamp(0, 1),
+        triangle=binding.triangle,
+        barycentric=binding.barycentric,
+        provenance={
+            "program": f"uika-drjit {__version__}",
+            "model": name,
+            "photos": " ".join(photo.sha256 for photo in prepared),
+        },
+    )
+    return Reconstruction(avatar, tuple(prepared), fit, report)
+
+
+def check_model(model: str | Path) -> None:
+    """Refuse a model that `reconstruct` could not use, before other work starts.
+
+    Raises:
+        UikaError: it is neither a built-in name nor an existing file.
+    """
+    if str(model) not in ("tiny", "none") and not Path(model).is_file():
+        raise UikaError(f"{model}: no such model; use 'tiny', 'none' or the path of a trained model (.safetensors)")
+
+
+def _network(model: str | Path) -> tuple[Reconstructor, str]:
+    from uika.model import build, load_checkpoint
+
+    check_model(model)
+    if str(model) in ("tiny", "none"):
+        return build("tiny").eval(), f"{model} (untrained)" if str(model) == "tiny" else "none"
+    network = load_checkpoint(model)
+    return network, f"{network.config.name} ({Path(model).name})"
+
+
+def _gaussians(
+    network: Reconstructor, inputs: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, SurfaceTexels], run: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
+    """Means, quats, scales, opacities, colours (batch first) and counts, from the network or from the surface alone."""
+    if run:
+        result = network(*inputs)
+        counts = dict(result.report)
+        return result.means, result.quats, result.scales, result.opacities, result.colors, counts
+    seen = network.observe(*inputs)
+    texel, surface = inputs[-2:]
+    opacities = torch.full((1, len(texel)), _UNTRAINED_OPACITY)
+    colors = seen.color.flatten(2)[:, :, texel].mT.contiguous()
+    return surface.points, surface.quats, surface.scales, opacities, colors, dict(seen.report)
+
+
+def _brightness(images: Tensor, valid: Tensor, weight: Tensor) -> float:
+    """How bright the photos show the head: median level of its well-seen pixels over that of skin in even light."""
+    levels = images.mean(1)[valid & (weight > 0.5)]
+    return 1.0 if len(levels) == 0 else float((levels.median() / _MID_FACE).clamp(0.3, 1.15))
