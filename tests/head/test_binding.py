@@ -111,6 +111,15 @@ def test_degenerate_triangles_give_rotations_and_finite_gradients(head: HeadMode
     assert crushed.grad is not None and bool(crushed.grad.isfinite().all())
 
 
+def test_no_gaussians_and_double_meshes_are_accepted(head: HeadModel) -> None:
+    gaussians, triangle, barycentric = gaussians_on(head)
+    none = tuple(part[:0] for part in gaussians)
+    posed = pose_gaussians(*none, head.template, head.template, head.faces, triangle[:0], barycentric[:0])
+    assert [tuple(part.shape) for part in posed] == [(0, 3), (0, 4), (0, 3)]
+    points = surface_points(head.template.double(), head.faces, uv_texels(head, 40))
+    assert points.dtype == torch.float64
+
+
 def test_gradients_with_respect_to_vertices_are_exact() -> None:
     generator = torch.Generator().manual_seed(4)
     flat = torch.randn(5, 3, dtype=torch.float64, generator=generator)

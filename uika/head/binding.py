@@ -103,8 +103,9 @@ def _interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor
     """Barycentric mix [...,M,C] of vertex values [...,V,C]."""
     # An embedding bag gathers and sums in one pass, several times faster than three gathers; frames ride as channels.
     table = values.movedim(-2, 0)
-    mixed = embedding_bag(corners, table.reshape(len(table), -1), per_sample_weights=barycentric, mode="sum")
-    return mixed.view(-1, *table.shape[1:]).movedim(0, -2)
+    weights = barycentric.to(values.dtype)
+    mixed = embedding_bag(corners, table.reshape(len(table), -1), per_sample_weights=weights, mode="sum")
+    return mixed.view(len(corners), *table.shape[1:]).movedim(0, -2)
 
 
 def _vertex_motion(canonical: Tensor, posed: Tensor, faces: Tensor) -> Tensor:
