@@ -6,7 +6,7 @@ from torch import Tensor
 
 from uika.correspondence import Fit, pixel_uv
 from uika.correspondence.hair import MAX_OFFSET, fit_hair
-from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project, rasterize
+from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, project, rasterize
 from uika.head import vertex_normals as normals_of
 
 SIZE = 256

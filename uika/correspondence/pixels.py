@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d, normalize
 
 from uika.correspondence.fit import Fit
 from uika.head import HeadModel, pose_vertices, project, rasterize, vertex_normals
 
-SURE_MATTE, FULL_MATTE = 0.6, 0.95  # matte values between which a pixel gains weight: edges carry background light
+SURE_MATTE, FULL_MATTE = 0.7, 0.98  # matte values between which a pixel gains weight: edges carry background light
+EDGE = 2  # pixels inside the matte's edge that are not trusted
 GRAZING, FACING = 0.08, 0.55  # cosines between which a pixel gains weight: grazing pixels smear over many texels
 
 
@@ -42,7 +43,8 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         normal = normalize((vertex_normals(vertices[n], head.faces)[corners] * mix[..., None]).sum(-2), dim=-1)
         surface = (vertices[n][corners] * mix[..., None]).sum(-2)
         cosine = (normal * normalize(camera.position - surface, dim=-1)).sum(-1)
-        trust = _ramp(matte, SURE_MATTE, FULL_MATTE) * _ramp(cosine, GRAZING, FACING)
+        inner = -max_pool2d(-matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
+        trust = _ramp(inner, SURE_MATTE, FULL_MATTE) * _ramp(cosine, GRAZING, FACING)
         seen = hit & (trust > 0)
         uv.append(torch.where(seen[..., None], place, torch.zeros(())))
         valid.append(seen)
