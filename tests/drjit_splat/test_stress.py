@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
 
 import pytest
 import torch
@@ -49,7 +48,7 @@ def test_log_scales_get_the_chain_factor() -> None:
     scene = random_scene(count=50)
     _, direct, _ = render_with_gradients(scene, 64, 64)
     logs = scene["scales"].log().requires_grad_()
-    _, alpha, _ = rasterization(**(scene | {"scales": logs.exp()}), width=64, height=64)
+    image, alpha, _ = rasterization(**(scene | {"scales": logs.exp()}), width=64, height=64)
     (image.sum() + alpha.sum()).backward()
     assert logs.grad is not None
     assert torch.allclose(logs.grad, direct["scales"] * scene["scales"], rtol=1e-3, atol=1e-4)
