@@ -205,7 +205,7 @@ def test_background_out_of_range(portrait_path: Path, background: tuple[float, .
 def test_import_is_light_and_the_models_are_silent(portrait_path: Path) -> None:
     code = (
         "import sys, uika.photo\n"
-        "assert not {'mediapipe', 'pymatting', 'PIL'} & set(sys.modules)\n"
+        "assert not {'mediapipe', 'scipy', 'PIL'} & set(sys.modules)\n"
         f"uika.photo.prepare({str(portrait_path)!r}, 64)\n"
         "print('after', file=sys.stderr)\n"
     )

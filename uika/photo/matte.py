@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 
+from uika.photo.closed_form import solve_alpha
+
 MAX_SOLVE = 512  # side in pixels above which the matte is solved smaller and enlarged
+MAX_FREE = 80_000  # free pixels above which it is solved smaller still: the factorisation would take many seconds
 SURE_INSIDE, SURE_OUTSIDE = 0.9, 0.1
 INSIDE_BAND, OUTSIDE_BAND = 0.02, 0.035  # of the crop side; the outer band is wider because hair strands lie outside
 MIN_ALPHA, MAX_ALPHA = 0.02, 0.98  # solver residue beyond these is rounded to nothing or to everything
@@ -35,32 +36,18 @@ def trimap(rough: NDArray[np.float32], sure: NDArray[np.bool_]) -> NDArray[np.fl
 def solve(image: NDArray[np.uint8], known: NDArray[np.float64]) -> NDArray[np.float32]:
     """Matte [S,S] in [0,1] of image [S,S,3] that agrees with the trimap `known` [S,S].
 
-    Closed-form matting (Levin, Lischinski and Weiss 2008) by pymatting, at `MAX_SOLVE` pixels or less.
+    Large crops, and those with much to decide, are solved smaller and enlarged.
     """
-    from pymatting.alpha.estimate_alpha_cf import estimate_alpha_cf
-
     size = known.shape[0]
-    small = min(size, MAX_SOLVE)
+    free = float((known == 0.5).mean())
+    small = min(size, MAX_SOLVE, round((MAX_FREE / max(free, 1e-6)) ** 0.5))
     pixels = _resize(image, small) / 255.0
     levels = known if small == size else np.round(2 * _resize(known.astype(np.float32), small)) / 2
     if not ((levels == 0).any() and (levels == 1).any() and (levels == 0.5).any()):
         return known.astype(np.float32)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # scipy and numba deprecations inside pymatting
-        alpha = estimate_alpha_cf(pixels, levels, laplacian_kwargs={"epsilon": 1e-6})
+    alpha = solve_alpha(pixels, levels)
     alpha = ((alpha - MIN_ALPHA) / (MAX_ALPHA - MIN_ALPHA)).clip(0, 1).astype(np.float32)
     return _resize(alpha, size).clip(0, 1)
-
-
-def foreground(image: NDArray[np.uint8], matte: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Colours [S,S,3] in [0,1] of the person alone, without the old background's tint in half-covered pixels.
-
-    Multi-level foreground estimation (Germer et al. 2020) by pymatting.
-    """
-    from pymatting.foreground.estimate_foreground_ml import estimate_foreground_ml
-
-    colours = estimate_foreground_ml((image / 255.0).astype(np.float32), matte)
-    return np.asarray(colours, dtype=np.float32).clip(0, 1)
 
 
 def _resize(image: NDArray, size: int) -> NDArray:

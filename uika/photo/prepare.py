@@ -14,6 +14,7 @@ from uika.photo import matte
 from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
 from uika.photo.detect import MIN_FACE, find_face
 from uika.photo.error import PhotoError
+from uika.photo.foreground import estimate_foreground
 from uika.photo.nets import person_mask
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
@@ -69,7 +70,7 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
     crop = resample(rgb, square, size)
     inside = coverage(rgb.shape[:2], square, size)
     alpha = _matte(crop, landmarks, inside)
-    colours = matte.foreground(crop, alpha)
+    colours = estimate_foreground((crop / 255).astype(np.float32), alpha)
     if picture.alpha is not None:
         given = (resample(picture.alpha, square, size) / 255).astype(np.float32)
         alpha, colours = _merge(alpha, given, colours, resample(picture.rgb, square, size))
