@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,9 +77,11 @@ def reconstruct(
     """
     if not 1 <= len(photos) <= MAX_PHOTOS:
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
+    from uika.complete import suppose
     from uika.correspondence import fit_photos, pixel_uv
     from uika.photo import head_matte, prepare
     from uika.surface import surface_texels
+    from uika.uv import aggregate
 
     report = Report() if report is None else report
     with report.stage("model"):
@@ -97,9 +99,13 @@ def reconstruct(
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
     with report.stage("reconstruction"), torch.no_grad():
         identity = fit.parameters.identity[0]
-        brightness = _brightness(images, valid, weight)
-        surface, binding = surface_texels(head, identity, fit.static_offset, network.config.map_size, brightness)
-        inputs = (images[None], mattes[None, :, None], uv[None], weight[None, :, None], binding.texel, surface)
+        surface, binding = surface_texels(head, identity, fit.static_offset, network.config.map_size)
+        views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
+        config = network.config.uv
+        pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=config.oversample)
+        known = (pooled.trust[0, 0] / config.full_trust).clamp(0, 1)
+        prior = suppose(head, binding, fit.static_offset, pooled.rgb[0], known, _brightness(images, weight))
+        inputs = (views, masks, uvs, weights, binding.texel, replace(surface, prior=prior))
         means, quats, scales, opacities, colors, counts = _gaussians(network, inputs, run=model != "none")
     report.counts.update(counts)
     avatar = Avatar(
@@ -157,7 +163,7 @@ def _gaussians(
     return surface.points, surface.quats, surface.scales, opacities, colors, dict(seen.report)
 
 
-def _brightness(images: Tensor, valid: Tensor, weight: Tensor) -> float:
+def _brightness(images: Tensor, weight: Tensor) -> float:
     """How bright the photos show the head: median level of its well-seen pixels over that of skin in even light."""
-    levels = images.mean(1)[valid & (weight > 0.5)]
+    levels = images.mean(1)[weight > 0.5]
     return 1.0 if len(levels) == 0 else float((levels.median() / _MID_FACE).clamp(0.3, 1.15))

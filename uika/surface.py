@@ -7,20 +7,18 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from uika.complete import regions
 from uika.head import Binding, HeadModel, HeadParameters, shaped_vertices, surface_frames, surface_points, uv_texels
 from uika.model import SurfaceTexels
 
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
 FLATNESS = 0.1  # standard deviation along the normal over the mean tangential one
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
-# sRGB colours under even light of parts that most photos do not show: a mouth that is shut must not open on skin.
-_HIDDEN = {"mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
-_REGIONS = ("eyeballs", "mouth_inner", "teeth")  # labelled 1, 2, 3; skin and hair are 0
 _MIRROR_TOLERANCE = 3e-3  # metres between a mirrored vertex and the vertex it stands for
 
 
 def surface_texels(
-    head: HeadModel, identity: Tensor, static_offset: Tensor, size: int, brightness: float = 1.0
+    head: HeadModel, identity: Tensor, static_offset: Tensor, size: int
 ) -> tuple[SurfaceTexels, Binding]:
     """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas.
 
@@ -32,11 +30,9 @@ def surface_texels(
         identity: [K] standard deviations.
         static_offset: [V,3] metres.
         size: side of the atlas in texels.
-        brightness: light in the photos, a factor on the colours supposed for the inside of the mouth.
 
     Returns:
-        The surface with batch dimension 1, its mirror map, regions and supposed colours; and the binding of its M
-        texels.
+        The surface with batch dimension 1, with its mirror map and regions, and the binding of its M texels.
     """
     binding = uv_texels(head, size)
     neutral = HeadParameters.zeros(head).replace(identity=identity)
@@ -45,22 +41,8 @@ def surface_texels(
     frames, sides = _texel_frames(head, vertices, binding, points)
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
     quats = _quaternions(frames)
-    regions = _regions(head, binding)
-    prior = torch.full((3, size, size), torch.nan)
-    for name, color in _HIDDEN.items():
-        prior[:, regions == _REGIONS.index(name) + 1] = brightness * torch.tensor(color)[:, None]
-    surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions, prior)
+    surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     return surface, binding
-
-
-def _regions(head: HeadModel, binding: Binding) -> Tensor:
-    """Labels [S,S] of the parts whose colours do not mix: place in `_REGIONS` plus one, 0 for the rest."""
-    labels = torch.zeros(len(binding), 1, dtype=torch.int64)
-    for index, name in enumerate(_REGIONS):
-        if name in head.masks:
-            share = (head.masks[name][head.faces[binding.triangle]] * binding.barycentric).sum(1)
-            labels[share > 0.5] = index + 1
-    return binding.to_map(labels)[0]
 
 
 @lru_cache(maxsize=4)
