@@ -1,1 +1,77 @@
-"""UIKA on Dr.Jit."""
+"""Photos in, an animatable 3D Gaussian head out.
+
+`reconstruct` makes an `Avatar` from photos, `get_motion` finds a `Motion`, `render` and `frames` make pictures of it.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from uika._version import __version__
+
+if TYPE_CHECKING:
+    from uika.acting import get_motion
+    from uika.avatar import Avatar, AvatarError
+    from uika.errors import UikaError
+    from uika.head import Camera, HeadModel, HeadParameters, load_head
+    from uika.motion import Motion, MotionError, load_motion
+    from uika.reconstruction import Reconstruction, reconstruct
+    from uika.rendering import Rendering, frames, neutral_camera, render
+    from uika.video import write_png, write_video
+
+_HOMES = {
+    "Avatar": "avatar",
+    "AvatarError": "avatar",
+    "Camera": "head",
+    "HeadModel": "head",
+    "HeadParameters": "head",
+    "Motion": "motion",
+    "MotionError": "motion",
+    "Reconstruction": "reconstruction",
+    "Rendering": "rendering",
+    "UikaError": "errors",
+    "frames": "rendering",
+    "get_motion": "acting",
+    "load_head": "head",
+    "load_motion": "motion",
+    "neutral_camera": "rendering",
+    "reconstruct": "reconstruction",
+    "render": "rendering",
+    "write_png": "video",
+    "write_video": "video",
+}
+
+__all__ = [
+    "Avatar",
+    "AvatarError",
+    "Camera",
+    "HeadModel",
+    "HeadParameters",
+    "Motion",
+    "MotionError",
+    "Reconstruction",
+    "Rendering",
+    "UikaError",
+    "__version__",
+    "frames",
+    "get_motion",
+    "load_head",
+    "load_motion",
+    "neutral_camera",
+    "reconstruct",
+    "render",
+    "write_png",
+    "write_video",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Loading torch takes longer than looking at a name should.
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,7 @@
+"""`python -m uika`."""
+
+import sys
+
+from uika.cli import main
+
+sys.exit(main())

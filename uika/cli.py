@@ -1,0 +1,68 @@
+"""The command line: parsing, and errors as one sentence each."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+# Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+from uika.errors import UikaError, install_command
+
+_ABOUT = "Photos in, an animatable 3D Gaussian head out. Add --debug to any command to see the traceback of an error."
+_WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments without the program's name; None takes those of the process.
+
+    Returns:
+        The exit code: 0 done, 1 something unexpected (or `doctor` found something missing), 2 unusable input, 130
+        interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    try:
+        return _parse([argument for argument in arguments if argument != "--debug"]).run()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return _INTERRUPTED
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        code, sentence = _explain(error)
+        hint = "" if code == _WRONG_INPUT or debug else " (--debug shows where)"
+        print(f"uika: {sentence}{hint}", file=sys.stderr)
+        return code
+
+
+def _parse(arguments: list[str]) -> Any:
+    try:
+        import tyro
+    except ModuleNotFoundError as error:
+        raise UikaError(f"the command line needs tyro; run: {install_command('tyro')}") from error
+    from uika.commands import Command
+
+    config = (tyro.conf.OmitArgPrefixes,)
+    return tyro.cli(Command, prog="uika", description=_ABOUT, args=arguments, config=config)  # type: ignore[arg-type]
+
+
+def _explain(error: Exception) -> tuple[int, str]:
+    """Exit code and sentence."""
+    text = " ".join(str(error).split())
+    if isinstance(error, ModuleNotFoundError) and (command := install_command(error.name or "")):
+        return _WRONG_INPUT, f"this needs the package '{error.name}'; run: {command}"
+    if isinstance(error, OSError) and error.strerror:
+        return _WRONG_INPUT, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, (ValueError, OSError)):
+        return _WRONG_INPUT, text
+    return _UNEXPECTED, f"unexpected {type(error).__name__}: {text}" if text else f"unexpected {type(error).__name__}"

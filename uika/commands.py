@@ -1,0 +1,199 @@
+"""The commands of the command line; each dataclass is one command's arguments."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from uika.errors import UikaError
+from uika.files import check_folder, check_output
+
+if TYPE_CHECKING:
+    from uika.reconstruction import Report
+
+PORTRAIT = Path(__file__).resolve().parent / "assets" / "portrait.jpg"
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Make an avatar from photos of one person.
+
+    Example: uika reconstruct front.jpg side.jpg -o me.safetensors
+    """
+
+    photos: Positional[tuple[Path, ...]]
+    """1 to 64 photos that show the face."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("avatar.safetensors")
+    """The avatar file to write."""
+    model: str = "tiny"
+    """tiny, none, or a trained model file."""
+
+    def run(self) -> int:
+        """Reconstruct and save."""
+        target = check_output(self.output, ".safetensors")
+        _check_photos(self.photos)
+        from uika.reconstruction import reconstruct
+
+        result = reconstruct(self.photos, model=self.model)
+        result.avatar.save(target)
+        _print_seconds(result.report)
+        print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Animate:
+    """Render a moving avatar as a video.
+
+    Example: uika animate me.safetensors --motion talk -o me.mp4
+    """
+
+    avatar: Positional[Path]
+    """The avatar file."""
+    motion: str = "talk"
+    """orbit, talk, expressions, or a motion file (.npz)."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
+    """The video to write."""
+    size: int = 512
+    """Side of the picture in pixels, even."""
+    fps: float | None = None
+    """Frames per second; 25 or the motion file's own if left out."""
+
+    def run(self) -> int:
+        """Render and encode."""
+        target = check_output(self.output, ".mp4")
+        from uika.acting import get_motion
+        from uika.avatar import Avatar
+        from uika.head import load_head
+        from uika.rendering import check_renderer, check_view, frames
+        from uika.video import check_even, write_video
+
+        check_view(0.0, 0.0, check_even(self.size))
+        avatar, head = Avatar.load(self.avatar), load_head()
+        avatar.check_head(head)
+        motion = get_motion(self.motion, head, self.fps)
+        check_renderer()
+        pictures = frames(avatar, motion, head=head, size=self.size, progress=True)
+        count = write_video(target, (picture.rgb for picture in pictures), motion.fps)
+        print(f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second")
+        return 0
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render an avatar at rest as a picture.
+
+    Example: uika render me.safetensors -o me.png --yaw 30
+    """
+
+    avatar: Positional[Path]
+    """The avatar file."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("frame.png")
+    """The picture to write."""
+    yaw: float = 0.0
+    """Degrees; positive shows the subject's left side."""
+    pitch: float = 0.0
+    """Degrees; positive looks from above."""
+    size: int = 512
+    """Side of the picture in pixels."""
+
+    def run(self) -> int:
+        """Render and save."""
+        target = check_output(self.output, ".png")
+        from uika.avatar import Avatar
+        from uika.head import HeadParameters, load_head
+        from uika.rendering import check_renderer, check_view, neutral_camera, render
+        from uika.video import write_png
+
+        check_view(self.yaw, self.pitch, self.size)
+        avatar, head = Avatar.load(self.avatar), load_head()
+        avatar.check_head(head)
+        check_renderer()
+        camera = neutral_camera(avatar, self.yaw, self.pitch, self.size)
+        write_png(target, render(avatar, HeadParameters.zeros(head), camera, head).rgb)
+        print(f"wrote {target}: {self.size}x{self.size} pixels")
+        return 0
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Turn the bundled portrait into an avatar, a talking video and a contact sheet.
+
+    Example: uika demo -o out/demo
+    """
+
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("out/demo")
+    """The folder for avatar.safetensors, talk.mp4 and sheet.png."""
+
+    def run(self) -> int:
+        """Do everything once, on one photo."""
+        folder = check_folder(self.output)
+        names = ("avatar.safetensors", "talk.mp4", "sheet.png")
+        avatar_file, video, picture = (check_output(folder / name, Path(name).suffix) for name in names)
+        from uika.acting import get_motion
+        from uika.head import load_head
+        from uika.reconstruction import reconstruct
+        from uika.rendering import check_renderer, frames
+        from uika.sheet import reconstruction_sheet
+        from uika.video import write_png, write_video
+
+        check_renderer()
+        head = load_head()
+        result = reconstruct([PORTRAIT], head)
+        result.avatar.save(avatar_file)
+        with result.report.stage("sheet"):
+            write_png(picture, reconstruction_sheet(result, head))
+        with result.report.stage("video"):
+            motion = get_motion("talk", head)
+            moving = frames(result.avatar, motion, head=head, progress=True)
+            write_video(video, (frame.rgb for frame in moving), motion.fps)
+        _print_seconds(result.report)
+        for path in (avatar_file, picture, video):
+            print(f"wrote {path}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, LLVM, threads and what is missing; exit 1 if something needed is.
+
+    Example: uika doctor
+    """
+
+    def run(self) -> int:
+        """Print the findings."""
+        from uika.doctor import examine
+
+        findings = examine()
+        for finding in findings:
+            print(f"{finding.subject:<12} {finding.value}")
+            if finding.remedy and finding.value in ("missing", "unusable"):
+                print(f"{'':<12} {'needed' if finding.needed else 'optional'}: {finding.remedy}")
+        return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
+
+
+Command = Reconstruct | Animate | Render | Demo | Doctor
+
+
+def _check_photos(photos: tuple[Path, ...]) -> None:
+    if not photos:
+        raise UikaError("give at least one photo, for example: uika reconstruct me.jpg")
+    for path in photos:
+        if path.is_dir():
+            raise UikaError(f"{path}: is a directory; give the photos in it one by one")
+        if not path.is_file():
+            raise UikaError(f"{path}: no such photo")
+
+
+def _photos(count: int) -> str:
+    return "1 photo" if count == 1 else f"{count} photos"
+
+
+def _print_seconds(report: Report) -> None:
+    rows = [*report.seconds.items(), ("total", math.fsum(report.seconds.values()))]
+    for name, seconds in rows:
+        print(f"{name:<16} {seconds:7.1f} s")

@@ -1,0 +1,78 @@
+"""What this machine has of what the program needs."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+from uika._version import __version__
+from uika.errors import EXTRAS, install_command
+
+_CORE = ("torch", "drjit", "numpy", "safetensors")
+_MODULES = {"pillow": "PIL", "pillow-heif": "pillow_heif"}  # distribution -> import name, where they differ
+_DISTRIBUTIONS = {module: name for name, module in _MODULES.items()}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination; `remedy` is empty when all is well."""
+
+    subject: str
+    value: str
+    remedy: str = ""
+    needed: bool = True  # whether the program cannot do its work without it
+
+
+def examine() -> list[Finding]:
+    """Look at Python, the packages, LLVM, the threads and the head file; nothing is changed."""
+    findings = [
+        Finding("uika-drjit", __version__),
+        Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
+    ]
+    findings += [_package(module, 'pip install "uika-drjit"') for module in _CORE]
+    findings += [
+        _package(module, install_command(module) or "", EXTRAS[module] in ("cli", "photo")) for module in EXTRAS
+    ]
+    return [*findings, _llvm(), _threads(), _head()]
+
+
+def _package(module: str, remedy: str, needed: bool = True) -> Finding:
+    name = _DISTRIBUTIONS.get(module, module)
+    if importlib.util.find_spec(module) is None:
+        return Finding(name, "missing", remedy, needed)
+    try:
+        return Finding(name, version(name), needed=needed)
+    except PackageNotFoundError:
+        return Finding(name, "version unknown", needed=needed)
+
+
+def _llvm() -> Finding:
+    try:
+        from drjit_splat.llvm import ENV, require
+
+        found = ".".join(str(part) for part in require())
+    except (ImportError, RuntimeError) as error:
+        return Finding("LLVM", "missing", str(error))
+    return Finding("LLVM", f"{found} ({os.environ.get(ENV, 'found by Dr.Jit')})")
+
+
+def _threads() -> Finding:
+    try:
+        import drjit
+        import torch
+    except ImportError:
+        return Finding("threads", f"{os.cpu_count()} cores")
+    return Finding("threads", f"{os.cpu_count()} cores, torch {torch.get_num_threads()}, Dr.Jit {drjit.thread_count()}")
+
+
+def _head() -> Finding:
+    try:
+        from uika.head import load_head
+
+        head = load_head()
+    except (ImportError, ValueError) as error:
+        return Finding("head model", "unusable", str(error))
+    return Finding("head model", f"{head.id} ({len(head.template)} vertices, {len(head.expression_names)} expressions)")
