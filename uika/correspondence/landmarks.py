@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from uika.head import HeadModel
+from uika.head import HeadModel, vertex_normals
 
 MESH_POINTS = 478
 FIRST_IRIS = 468
@@ -36,6 +37,7 @@ BOUND_WEIGHT = 60.0  # soft walls at activations 0 and 1
 DISTANCE, DISTANCE_SPREAD = 1.1, 0.35  # metres and log-spread: focal length and distance trade off on one photo
 STEPS = (12, 18)
 MAX_DAMPING = 1e9
+HIDDEN, FACING, HIDDEN_TRUST = 0.0, 0.6, 0.1  # cosines of the viewing angle between which a landmark gains trust
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class _Problem:
     identity: Tensor  # [K,L,3]
     expression: Tensor  # [E,L,3]
     target: Tensor  # [N,L,2] pixels relative to the principal point
-    weight: Tensor  # [L]
+    weight: Tensor  # [N,L]
+    normal: Tensor  # [L,3] of the mean head
     shape_rows: Tensor  # [L] 1 where the landmark tells about identity
     free: Tensor  # [E] 1 where the expression is fitted
     pixel_unit: Tensor  # [N] pixels of one outer eye-corner distance
@@ -87,12 +90,14 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
     ids = exact.landmark_ids
     weight = exact.landmark_weights.clone()
     weight[torch.isin(ids, torch.tensor(EYELIDS + LIPS))] *= CONTOUR_WEIGHT
+    N = len(landmarks)
     problem = _Problem(
         points=exact.landmarks(exact.template),
         identity=exact.landmarks(exact.identity_basis),
         expression=exact.landmarks(exact.expression_basis),
         target=landmarks.double()[:, ids] - size / 2,
-        weight=weight / weight.mean(),
+        weight=(weight / weight.mean()).expand(N, -1),
+        normal=normalize(exact.landmarks(vertex_normals(exact.template, exact.faces)), dim=-1),
         shape_rows=(ids < FIRST_IRIS).double(),
         free=torch.tensor([name not in UNFITTED for name in exact.expression_names], dtype=torch.float64),
         pixel_unit=torch.ones(len(landmarks), dtype=torch.float64),
@@ -100,7 +105,6 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
     )
     rotation, translation, focal, unit = _weak_perspective(problem, _eye_distance(exact))
     problem = replace(problem, pixel_unit=unit)
-    N = len(landmarks)
     state = LandmarkFit(
         torch.zeros(K, dtype=torch.float64),
         torch.zeros(N, E, dtype=torch.float64),
@@ -110,7 +114,8 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
         torch.zeros(N, dtype=torch.float64),
     )
     for prior, steps in zip(IDENTITY_PRIOR, STEPS, strict=True):
-        state = _solve(replace(problem, identity_prior=prior), state, steps)
+        seen = problem.weight * _facing(problem, state)
+        state = _solve(replace(problem, weight=seen, identity_prior=prior), state, steps)
     distance = (_project(problem, state)[0] - problem.target).norm(dim=-1)
     return replace(state, error=distance.mean(-1) / problem.pixel_unit)
 
@@ -144,6 +149,13 @@ def _project(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Tensor]:
     points = points + torch.einsum("ne,elc->nlc", state.expression, problem.expression)
     camera = points @ state.rotation.mT + state.translation[:, None]
     return state.focal[:, None, None] * camera[..., :2] / camera[..., 2:], camera
+
+
+def _facing(problem: _Problem, state: LandmarkFit) -> Tensor:
+    """Trust [N,L] by viewing angle: the detector guesses what is turned away, and its guesses are biased."""
+    _, camera = _project(problem, state)
+    cosine = -(problem.normal @ state.rotation.mT * normalize(camera, dim=-1)).sum(-1)
+    return ((cosine - HIDDEN) / (FACING - HIDDEN)).clamp(HIDDEN_TRUST, 1.0).square()
 
 
 def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
