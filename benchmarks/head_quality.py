@@ -1,4 +1,4 @@
-"""How good a reconstruction is: `python -m benchmarks.head_quality [-o FOLDER]` prints a table and saves it with a picture.
+"""How good a reconstruction is: `python -m benchmarks.head_quality [-o FOLDER]` prints a table and saves a picture.
 
 On the bundled portrait: colour error in the face, silhouette, landmarks, each at the photo's own camera. On renders of
 a known head: splats against Mitsuba's mesh, and avatars from one, two and four photos, in any order.
@@ -35,8 +35,8 @@ from uika.head import (
 )
 from uika.metrics import mask_iou, psnr
 from uika.photo import head_matte
-from uika.reconstruct import Reconstruction, reconstruct
-from uika.render import render
+from uika.reconstruction import Reconstruction, reconstruct
+from uika.rendering import render
 
 PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 VIEWS = (0.0, 35.0, -35.0, 15.0)  # yaw of the synthetic photos, degrees

@@ -1,0 +1,86 @@
+"""From a real photo to a moving head, with the figures the project promises."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.head_quality import PORTRAIT, mesh_figures, photograph, photos_figures, portrait_figures
+from uika.avatar import Avatar
+from uika.head import HeadModel, HeadParameters, load_head, look_at
+from uika.reconstruction import Reconstruction, reconstruct
+from uika.rendering import render
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+@pytest.fixture(scope="module")
+def portrait(head: HeadModel) -> Reconstruction:
+    return reconstruct([PORTRAIT], head)
+
+
+def test_avatar_looks_like_its_photo(portrait: Reconstruction, head: HeadModel) -> None:
+    figures, _ = portrait_figures(portrait, head)
+    print(figures)
+    assert figures.face_psnr >= 24
+    assert figures.silhouette_iou >= 0.85
+    assert figures.landmark_percent <= 2.5
+    assert figures.gaussians >= 40_000
+
+
+def test_hair_is_kept(portrait: Reconstruction, head: HeadModel) -> None:
+    params = HeadParameters.zeros(head).replace(identity=portrait.avatar.identity)
+    camera = look_at(0.0, 0.0, 1.2, fov_y=20.0, size=256)
+    with_hair = render(portrait.avatar, params, camera, head).alpha.sum()
+    lifted = portrait.avatar.static_offset.norm(dim=-1)
+    assert lifted.max() > 0.03
+    assert lifted.max() <= 0.1 + 1e-6
+    assert with_hair > 0.15 * 256 * 256
+
+
+def test_splats_agree_with_mitsuba(portrait: Reconstruction, head: HeadModel) -> None:
+    for figures in mesh_figures(portrait.avatar, head):
+        print(figures)
+        assert figures.mask_iou >= 0.95
+        assert figures.depth_median_mm <= 3.0
+
+
+def test_network_at_its_start_keeps_the_surface(portrait: Reconstruction, head: HeadModel) -> None:
+    plain = reconstruct([PORTRAIT], head, model="none").avatar
+    tiny = portrait.avatar
+    assert torch.equal(plain.means, tiny.means)
+    assert (plain.colors - tiny.colors).abs().max() < 2e-3
+
+
+def test_avatar_survives_its_file(portrait: Reconstruction, tmp_path: Path) -> None:
+    portrait.avatar.save(tmp_path / "avatar.safetensors")
+    loaded = Avatar.load(tmp_path / "avatar.safetensors")
+    for name in ("means", "quats", "scales", "opacities", "colors", "identity", "static_offset", "triangle"):
+        assert torch.equal(getattr(loaded, name), getattr(portrait.avatar, name)), name
+
+
+@pytest.mark.slow
+def test_any_number_of_photos_in_any_order(portrait: Reconstruction, head: HeadModel) -> None:
+    for figures in photos_figures(portrait.avatar, head, counts=(1, 2, 4)):
+        print(figures)
+        assert figures.order_change <= 1e-4
+        assert figures.seen_psnr >= 20
+
+
+def test_two_photos_of_a_known_head(portrait: Reconstruction, head: HeadModel, tmp_path: Path) -> None:
+    from PIL import Image
+
+    paths = []
+    for yaw in (0.0, 30.0):
+        picture = photograph(portrait.avatar, head, yaw, spp=16)[0]
+        paths.append(tmp_path / f"view{yaw:.0f}.png")
+        Image.fromarray((picture * 255).round().to(torch.uint8).numpy()).save(paths[-1])
+    result = reconstruct(paths, head)
+    assert len(result.fit.error) == 2
+    assert result.fit.error.max() < 0.03
+    back = reconstruct(paths[::-1], head).avatar
+    assert (back.means - result.avatar.means).abs().max() <= 1e-4
+    assert (back.colors - result.avatar.colors).abs().max() <= 1e-4
