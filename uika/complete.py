@@ -14,6 +14,7 @@ from uika.head import Binding, HeadModel
 # sRGB colours under even light of parts that lids and lips hide: no skin may appear there when they open.
 _HIDDEN = {"eyeballs": (0.75, 0.71, 0.69), "mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
 _REGIONS = ("eyeballs", "mouth_inner", "teeth")  # labelled 1, 2, 3; skin and hair are 0
+MOUTH = 2
 _HAIR_DEPTH = 0.012  # metres that hair stands off the scalp where it surely is hair
 _BARE = 0.1  # hairiness up to which the face counts as bare skin
 _SOURCE = 30.0  # pull of a fully seen vertex towards its own colour, relative to an edge

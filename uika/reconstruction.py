@@ -14,6 +14,7 @@ from torch import Tensor
 
 from uika._version import __version__
 from uika.avatar import Avatar
+from uika.complete import MOUTH, regions, suppose
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 
@@ -77,7 +78,6 @@ def reconstruct(
     """
     if not 1 <= len(photos) <= MAX_PHOTOS:
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
-    from uika.complete import suppose
     from uika.correspondence import fit_photos, pixel_uv
     from uika.photo import head_matte, prepare
     from uika.surface import surface_texels
@@ -101,6 +101,7 @@ def reconstruct(
         identity = fit.parameters.identity[0]
         surface, binding = surface_texels(head, identity, fit.static_offset, network.config.map_size)
         views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
+        weights = weights * _plausible(regions(head, binding), uvs)
         config = network.config.uv
         pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=config.oversample)
         known = (pooled.trust[0, 0] / config.full_trust).clamp(0, 1)
@@ -161,6 +162,16 @@ def _gaussians(
     opacities = torch.full((1, len(texel)), _UNTRAINED_OPACITY)
     colors = seen.color.flatten(2)[:, :, texel].mT.contiguous()
     return surface.points, surface.quats, surface.scales, opacities, colors, dict(seen.report)
+
+
+def _plausible(labels: Tensor, uv: Tensor) -> Tensor:
+    """0 for pixels [1,V,1,H,W] that seem to show the inside of the mouth, else 1.
+
+    A fit that is a millimetre off puts teeth on the tongue, where they stay when the mouth opens.
+    """
+    size = len(labels)
+    column, row = (torch.nan_to_num(uv) * size).long().clamp(0, size - 1).unbind(2)
+    return (labels[row, column] != MOUTH).to(uv.dtype)[:, :, None]
 
 
 def _brightness(images: Tensor, weight: Tensor) -> float:
