@@ -64,7 +64,7 @@ def projection_adjoint(
     outputs = e.geometry()
 
     m = packet(be, moments, i, MOMENTS)
-    _, _, a, h, d, _ = packet(be, records, i * (RECORD // 8), 8)[:6]
+    _, _, a, h, d = packet(be, records, i * (RECORD // 8), 8)[:5]
     ln2 = math.log(2.0)
     gradients = [
         2 * ln2 * a * m[1],

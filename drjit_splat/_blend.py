@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from . import constants as c
-from ._backend import PIXELS, TILE, Backend, bits_of, packet, power_of_two, write
+from ._backend import PIXELS, TILE, Backend, bits_of, exp2, packet, power_of_two, smaller, write
 from ._inputs import Settings
 from ._lists import TileLists, lane_order
 from ._project import RECORD
@@ -16,6 +16,12 @@ from ._project import RECORD
 RECURRENCE_EPS2D = 0.25
 """Least low-pass (pixels^2) for which a tile's corner, from which the recurrence starts, cannot underflow: the
 exponent there is at most (sqrt(2 ln 255) + 3 sqrt(2 / eps2d))^2 / 2 nats."""
+
+
+UNROLL = 2
+"""List entries a turn of the loop. Every turn saves and selects all sums, and waits for its gathers, once."""
+
+SIGN = 0x80000000
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,7 @@ class Tile:
     last: Any
     width: Any
     height: Any
+    used: Any  # whether the lane has a tile of the image
 
     def pixels(self) -> list[tuple[Any, Any]]:
         """Flat index of each of the 16 pixels and whether it lies in the image, row by row."""
@@ -52,6 +59,7 @@ def tile_of(be: Backend, index: Any, lists: TileLists, settings: Settings) -> Ti
         dr.gather(J.UInt32, lists.start, index + 1),
         dr.opaque(J.UInt32, settings.width),
         dr.opaque(J.UInt32, settings.height),
+        index < dr.opaque(J.UInt32, lists.tiles),
     )
 
 
@@ -61,25 +69,27 @@ def offsets(be: Backend, tile: Tile, geometry: list[Any]) -> tuple[Any, Any]:
     return dr.fma(geometry[3], dy, dx), dy
 
 
-def raw_alphas(geometry: list[Any], s: Any, t: Any, recurrence: bool) -> list[Any]:
-    """opacity * exp(-sigma) at the tile's 16 pixels, row by row; `s`, `t` as `offsets` gives them.
+def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, recurrence: bool, active: Any) -> list[Any]:
+    """opacity * exp(-sigma) at the tile's 16 pixels, row by row; next to nothing in lanes that are not active
+    (their geometry must be zero, or the ratios could make something of it).
 
     Along a row and down the first column the Gaussian's ratio of neighbours is itself geometric, so two
-    multiplications a pixel replace an exponential.
+    multiplications a pixel replace an exponential. `s`, `t` are as `offsets` gives them.
     """
-    _, _, a, h, d, log_opacity = geometry[:6]
+    _, _, a, h, d, log_opacity, bend_x, twist = geometry
+    log_opacity = dr.select(active, log_opacity, -125.0)
     if not recurrence:
         values = []
         for k in range(PIXELS):
             row = float(k // TILE)
             x, y = dr.fma(h, row, s + float(k % TILE)), t + row
-            values.append(dr.exp2(log_opacity - dr.fma(a * x, x, d * y * y)))
+            values.append(exp2(be, log_opacity - dr.fma(a * x, x, d * y * y)))
         return values
     ah = a * h
-    corner = dr.exp2(log_opacity - dr.fma(a * s, s, d * t * t))
-    right = dr.exp2(-a * dr.fma(2.0, s, 1.0))
-    down = dr.exp2(-dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)))
-    bend_x, bend_y, twist = dr.exp2(-2.0 * a), dr.exp2(-2.0 * dr.fma(ah, h, d)), dr.exp2(-2.0 * ah)
+    corner = exp2(be, log_opacity - dr.fma(a * s, s, d * t * t))
+    right = exp2(be, -a * dr.fma(2.0, s, 1.0))
+    down = exp2(be, -dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)))
+    bend_y = exp2(be, -2.0 * dr.fma(ah, h, d))
     values = []
     for row in range(TILE):
         value, ratio = corner, right
@@ -87,10 +97,35 @@ def raw_alphas(geometry: list[Any], s: Any, t: Any, recurrence: bool) -> list[An
             values.append(value)
             if column < TILE - 1:
                 value = value * ratio
+            if column < TILE - 2:
                 ratio = ratio * bend_x
         if row < TILE - 1:
-            corner, down, right = corner * down, down * bend_y, right * twist
+            corner, right = corner * down, right * twist
+        if row < TILE - 2:
+            down = down * bend_y
     return values
+
+
+def clamped_alpha(raw: Any) -> Any:
+    """Opacity of a pair: held at ALPHA_MAX, nothing below ALPHA_MIN."""
+    return dr.select(raw < c.ALPHA_MIN, 0.0, smaller(raw, c.ALPHA_MAX))
+
+
+def step(be: Backend, alpha: Any, transmittance: Any) -> tuple[Any, Any, Any]:
+    """Whether the pair is blended, its weight, and the transmittance behind it (negated once the pixel has stopped)."""
+    after = dr.fma(-alpha, transmittance, transmittance)
+    alive = after > c.T_MIN
+    stopped = dr.reinterpret_array(be.plain.Float, bits_of(be, transmittance) | SIGN)
+    return alive, dr.select(alive, alpha * transmittance, 0.0), dr.select(alive, after, stopped)
+
+
+def entries(be: Backend, lists: TileLists, k: Any, stop: Any) -> list[tuple[Any, Any]]:
+    """The next UNROLL list entries of each lane and whether they come before `stop`."""
+    found = []
+    for j in range(UNROLL):
+        active = k + j < stop
+        found.append((dr.gather(be.plain.UInt32, lists.ids, k + j, active), active))
+    return found
 
 
 def all_done(be: Backend, transmittances: list[Any]) -> Any:
@@ -98,14 +133,14 @@ def all_done(be: Backend, transmittances: list[Any]) -> Any:
     combined = bits_of(be, transmittances[0])
     for transmittance in transmittances[1:]:
         combined &= bits_of(be, transmittance)
-    return combined >= 0x80000000
+    return combined >= SIGN
 
 
-def read_features(be: Backend, records: Any, splat: Any, count: int) -> list[Any]:
-    """The first `count` features of a record."""
+def read_features(be: Backend, records: Any, splat: Any, count: int, active: Any) -> list[Any]:
+    """The first `count` features of a record; zeros where not active."""
     size = power_of_two(count)
     ratio = RECORD // size
-    return packet(be, records, ratio * splat + ratio // 2, size)[:count]
+    return packet(be, records, ratio * splat + ratio // 2, size, active)[:count]
 
 
 @dataclass(frozen=True)
@@ -115,7 +150,7 @@ class Blended:
     features: Any  # [H * W * F]
     transmittance: Any  # [H * W], what is left behind the splats
     end: Any  # [tiles] one past the last list entry that was looked at
-    order: Any  # [tiles] lane order by that work, for the backward pass
+    order: Any  # [lanes] lane order by that work, for the backward pass
 
 
 def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> Blended:
@@ -126,22 +161,16 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     recurrence = settings.eps2d >= RECURRENCE_EPS2D
 
     def body(k: Any, transmittances: list[Any], sums: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-        splat = dr.gather(J.UInt32, lists.ids, k)
-        geometry = packet(be, records, 2 * splat, 8)
-        values = read_features(be, records, splat, features)
-        alphas = raw_alphas(geometry, *offsets(be, tile, geometry), recurrence)
         transmittances, sums = list(transmittances), list(sums)
-        for p, raw in enumerate(alphas):
-            alpha = dr.select(raw < c.ALPHA_MAX, raw, c.ALPHA_MAX)
-            alpha = dr.select(raw < c.ALPHA_MIN, 0.0, alpha)
-            t = transmittances[p]
-            after = dr.fma(-alpha, t, t)
-            alive = after > c.T_MIN
-            weight = dr.select(alive, alpha * t, 0.0)
-            transmittances[p] = dr.select(alive, after, -dr.abs(t))
-            for f, value in enumerate(values):
-                sums[p * features + f] = dr.fma(weight, value, sums[p * features + f])
-        return k + 1, transmittances, sums
+        for splat, active in entries(be, lists, k, tile.last):
+            geometry = packet(be, records, 2 * splat, 8, active)
+            values = read_features(be, records, splat, features, active)
+            alphas = raw_alphas(be, geometry, *offsets(be, tile, geometry), recurrence, active)
+            for p, raw in enumerate(alphas):
+                _, weight, transmittances[p] = step(be, clamped_alpha(raw), transmittances[p])
+                for f, value in enumerate(values):
+                    sums[p * features + f] = dr.fma(weight, value, sums[p * features + f])
+        return k + UNROLL, transmittances, sums
 
     start = [dr.select(inside, J.Float(1.0), J.Float(-1.0)) for _, inside in pixels]
     k, transmittances, sums = dr.while_loop(
@@ -157,7 +186,6 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
         for f in range(features):
             write(image, sums[p * features + f], index * features + f, inside)
     end = dr.empty(J.UInt32, lists.tiles)
-    write(end, k, tile.index)
+    write(end, smaller(k, tile.last), tile.index, tile.used)
     dr.eval(image, left, end)
-    i = dr.arange(J.UInt32, lists.tiles)
-    return Blended(image, left, end, lane_order(be, end - dr.gather(J.UInt32, lists.start, i), lists.tiles))
+    return Blended(image, left, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))

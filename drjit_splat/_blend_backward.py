@@ -8,7 +8,18 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import TILE, Backend, add_packet, packet, power_of_two
-from ._blend import RECURRENCE_EPS2D, Blended, offsets, raw_alphas, read_features, tile_of
+from ._blend import (
+    RECURRENCE_EPS2D,
+    UNROLL,
+    Blended,
+    clamped_alpha,
+    entries,
+    offsets,
+    raw_alphas,
+    read_features,
+    step,
+    tile_of,
+)
 from ._inputs import Settings
 from ._lists import TileLists
 
@@ -35,7 +46,7 @@ def blend_backward(
     """
     J = be.plain
     tile = tile_of(be, blended.order, lists, settings)
-    stop = dr.gather(J.UInt32, blended.end, tile.index)
+    stop = dr.gather(J.UInt32, blended.end, tile.index, tile.used)
     recurrence = settings.eps2d >= RECURRENCE_EPS2D
     padded = power_of_two(features)
 
@@ -53,36 +64,31 @@ def blend_backward(
         start.append(dr.select(inside, J.Float(1.0), J.Float(-1.0)))
 
     def body(k: Any, transmittances: list[Any], behind: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-        splat = dr.gather(J.UInt32, lists.ids, k)
-        geometry = packet(be, records, 2 * splat, 8)
-        values = read_features(be, records, splat, features)
-        s, t0 = offsets(be, tile, geometry)
-        alphas = raw_alphas(geometry, s, t0, recurrence)
         transmittances, behind = list(transmittances), list(behind)
-        by_value = [J.Float(0) for _ in range(features)]
-        total = J.Float(0)
-        slopes = []
-        for p, raw in enumerate(alphas):
-            clamped = raw >= c.ALPHA_MAX
-            alpha = dr.select(clamped, c.ALPHA_MAX, raw)
-            alpha = dr.select(raw < c.ALPHA_MIN, 0.0, alpha)
-            t = transmittances[p]
-            after = dr.fma(-alpha, t, t)
-            alive = after > c.T_MIN
-            weight = dr.select(alive, alpha * t, 0.0)
-            transmittances[p] = dr.select(alive, after, -dr.abs(t))
-            shade = J.Float(0)
-            for f, value in enumerate(values):
-                shade = dr.fma(value, gradients[p][f], shade)
-                by_value[f] = dr.fma(weight, gradients[p][f], by_value[f])
-            behind[p] = dr.fma(-weight, shade, behind[p])
-            slope = dr.fma(weight, shade, -behind[p] * alpha / (1.0 - alpha))
-            slopes.append(dr.select(alive & ~clamped, slope, 0.0))
-            total += weight
-        write = total > 0.0
-        add_packet(be, moments, _moments(J, slopes, geometry[3], s, t0), splat, write)
-        add_packet(be, grad_values, by_value + [J.Float(0)] * (padded - features), splat, write)
-        return k + 1, transmittances, behind
+        for splat, active in entries(be, lists, k, stop):
+            geometry = packet(be, records, 2 * splat, 8, active)
+            values = read_features(be, records, splat, features, active)
+            s, t = offsets(be, tile, geometry)
+            by_value = [J.Float(0) for _ in range(features)]
+            total = J.Float(0)
+            slopes = []
+            for p, raw in enumerate(raw_alphas(be, geometry, s, t, recurrence, active)):
+                alpha = clamped_alpha(raw)
+                alive, weight, transmittances[p] = step(be, alpha, transmittances[p])
+                shade = values[0] * gradients[p][0]
+                by_value[0] = dr.fma(weight, gradients[p][0], by_value[0])
+                for f in range(1, features):
+                    shade = dr.fma(values[f], gradients[p][f], shade)
+                    by_value[f] = dr.fma(weight, gradients[p][f], by_value[f])
+                shade *= weight
+                behind[p] -= shade
+                slope = dr.fma(-behind[p], alpha / (1.0 - alpha), shade)
+                slopes.append(dr.select(alive & (raw < c.ALPHA_MAX), slope, 0.0))
+                total += weight
+            blended_here = total > 0.0
+            add_packet(be, moments, _moments(J, slopes, geometry[3], s, t), splat, blended_here)
+            add_packet(be, grad_values, by_value + [J.Float(0)] * (padded - features), splat, blended_here)
+        return k + UNROLL, transmittances, behind
 
     dr.while_loop((tile.first, start, behind), lambda k, t, r: k < stop, body, mode="symbolic")
 

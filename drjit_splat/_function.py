@@ -33,10 +33,8 @@ class Trace:
         """List entries that were never looked at because their tile was already opaque."""
         if self.lists is None or self.projected is None:
             return 0
-        J = self.be.plain
-        i = dr.arange(J.UInt32, self.lists.tiles)
         # Every chunk takes the same decisions, so the first speaks for all.
-        seen = dr.sum(J.UInt32(self.chunks[0][3].end - dr.gather(J.UInt32, self.lists.start, i)))
+        seen = dr.sum(self.lists.lengths(self.be, self.chunks[0][3].end))
         return self.projected.pairs - int(seen[0])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -15,6 +15,8 @@ from ._project import Footprint, Projected
 
 DIGIT_BITS = 12  # widest digit whose bucket counts stay in the first-level cache during a counting pass
 BYTES_PER_PAIR = 24
+REGION = 16  # tiles along each side of a region: its splats fit the second-level cache
+LENGTH_BUCKETS = 1024  # longer lists count as equally long when lanes are matched
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,23 @@ class TileLists:
     """For each tile the splats that can touch it, near to far: `ids[start[t]:start[t + 1]]`."""
 
     ids: Any  # [pairs] splat of each entry
-    start: Any  # [tiles + 1]
-    order: Any  # [tiles] the tile that each lane renders
+    start: Any  # [tiles + 2], the last for the unused tile
+    order: Any  # [lanes] the tile that each lane renders, `tiles` in idle lanes
     columns: int
-    tiles: int
+    rows: int
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles of the image."""
+        return self.columns * self.rows
+
+    def lengths(self, be: Backend, end: Any | None = None) -> Any:
+        """Entries of each tile's list, up to `end` [tiles] when it is given."""
+        i = dr.arange(be.plain.UInt32, self.tiles)
+        last = dr.gather(be.plain.UInt32, self.start, i + 1) if end is None else end
+        lengths = last - dr.gather(be.plain.UInt32, self.start, i)
+        dr.eval(lengths)
+        return lengths
 
 
 def _sorted_by(be: Backend, keys: Any, bits: int) -> Any:
@@ -100,9 +115,9 @@ def _emit(
 
 
 def _starts(be: Backend, tile: Any, order: Any, tiles: int, pairs: int) -> Any:
-    """For each tile (and one past the last) the first position in `tile[order]` that is not below it."""
+    """For each tile, the unused one and one past it, the first position in `tile[order]` that is not below it."""
     J = be.plain
-    wanted = dr.arange(J.UInt32, tiles + 1)
+    wanted = dr.arange(J.UInt32, tiles + 2)
 
     def body(low: Any, high: Any) -> tuple[Any, Any]:
         middle = (low + high) >> 1
@@ -115,25 +130,27 @@ def _starts(be: Backend, tile: Any, order: Any, tiles: int, pairs: int) -> Any:
     return low
 
 
-def lane_order(be: Backend, lengths: Any, tiles: int) -> Any:
-    """Tiles by decreasing work, dealt out so that the lanes of a packet and the blocks of a launch are even."""
+def lane_order(be: Backend, lengths: Any, columns: int, rows: int) -> Any:
+    """The tile that each lane takes: region by region, and by decreasing work inside a region.
+
+    Neighbouring tiles share splats, so a region's records and gradients stay in a core's cache; the lanes of one packet
+    get lists of similar length. Lanes of a region that hang over the image take the tile number `columns * rows`.
+    """
     J = be.plain
-    top = (1 << DIGIT_BITS) - 1
-    keys = J.UInt32(top) - smaller(lengths, J.UInt32(top))
-    dr.eval(keys)
-    by_length = dr.detail.block_mkperm(keys, tiles, top + 1)
-    # Sixteen lanes fill the widest packet. Position p takes sorted packet (p mod groups) * share + p // groups' mirror.
-    groups = 16
-    packets = tiles // 16
-    share = packets // groups
-    if share == 0:
-        return by_length
-    i = dr.arange(J.UInt32, tiles)
-    group_count, share_count = dr.opaque(J.UInt32, groups), dr.opaque(J.UInt32, share)
-    position = i >> 4
-    dealt = (position % share_count) * group_count + position // share_count
-    source = dr.select(position < group_count * share_count, (dealt << 4) + (i & 15), i)
-    return dr.gather(J.UInt32, by_length, source)
+    across, down = -(-columns // REGION), -(-rows // REGION)
+    area = REGION * REGION
+    lane = dr.arange(J.UInt32, across * down * area)
+    opaque_across = dr.opaque(J.UInt32, across)
+    region, local = lane // area, lane % area
+    region_row = region // opaque_across
+    x = (region - region_row * opaque_across) * REGION + local % REGION
+    y = region_row * REGION + local // REGION
+    inside = (x < dr.opaque(J.UInt32, columns)) & (y < dr.opaque(J.UInt32, rows))
+    tile = dr.select(inside, y * dr.opaque(J.UInt32, columns) + x, dr.opaque(J.UInt32, columns * rows))
+    top = LENGTH_BUCKETS - 1
+    keys = J.UInt32(top) - smaller(dr.gather(J.UInt32, lengths, tile, inside), J.UInt32(top))
+    dr.eval(keys, tile)
+    return dr.gather(J.UInt32, tile, dr.detail.block_mkperm(keys, area, LENGTH_BUCKETS))
 
 
 def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
@@ -155,9 +172,8 @@ def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
     start = _starts(be, tile, by_tile, tiles, projected.pairs)
     ids = dr.gather(J.UInt32, splat, by_tile)
     dr.eval(start, ids)
-    i = dr.arange(J.UInt32, tiles)
-    lengths = dr.gather(J.UInt32, start, i + 1) - dr.gather(J.UInt32, start, i)
-    return TileLists(ids, start, lane_order(be, lengths, tiles), columns, tiles)
+    lists = TileLists(ids, start, None, columns, rows)
+    return replace(lists, order=lane_order(be, lists.lengths(be), columns, rows))
 
 
 def _by_tile(be: Backend, tile: Any, tiles: int, pairs: int) -> Any:

@@ -14,7 +14,7 @@ from ._backend import TILE, Backend, bits_of, flat, larger, packet, power_of_two
 from ._inputs import Settings
 
 LOG2E = math.log2(math.e)
-RECORD = 16  # floats a splat: 8 of geometry (x, y, A, 2B, C, log2 opacity, 2 spare), then up to 8 features
+RECORD = 16  # floats a splat: 8 of geometry (see Ellipse.geometry; 2^-2a, 2^-2ah), then up to 8 features
 CULLED = ("", "depth", "degenerate", "opacity", "offscreen", "radius_clip")
 
 
@@ -267,7 +267,8 @@ def run(
     zero = J.Float(0)
     values = [*colors, e.z][:first_features] if features > columns else colors[:first_features]
     values += [zero] * (power_of_two(first_features) - first_features)
-    write_packet(be, records, [*geometry, zero, zero], 2 * i)
+    bends = [dr.exp2(-2.0 * geometry[2]), dr.exp2(-2.0 * geometry[2] * geometry[3])]
+    write_packet(be, records, [*geometry, *bends], 2 * i)
     ratio = RECORD // len(values)
     write_packet(be, records, values, ratio * i + ratio // 2)
     write_packet(

@@ -35,6 +35,15 @@ def test_sizes_that_are_no_multiple_of_the_tile(width: int, height: int) -> None
     assert_close(compare(random_scene(width=width, height=height), width, height), gradient=1e-3)
 
 
+def test_small_splats_on_a_larger_image() -> None:
+    # Lists of odd length end inside a turn of the loop; the idle half must not show the first splat's tail.
+    scene = random_scene(count=400, width=160, height=120, seed=5)
+    scene["scales"] *= 0.15
+    scene["means"][0] = torch.tensor([0.8, 0.8, 0.0])
+    scene["scales"][0], scene["opacities"][0] = 1e-3, 0.99
+    assert_close(compare(scene, 160, 120))
+
+
 def test_two_cameras() -> None:
     c = compare(random_scene(cameras=2), 64, 64)
     assert_close(c)
