@@ -8,12 +8,22 @@ import torch
 from torch import Tensor
 
 from uika.complete import regions
-from uika.head import Binding, HeadModel, HeadParameters, shaped_vertices, surface_frames, surface_points, uv_texels
+from uika.head import (
+    Binding,
+    HeadModel,
+    HeadParameters,
+    shaped_vertices,
+    surface_frames,
+    surface_points,
+    uv_texels,
+    vertex_normals,
+)
 from uika.model import SurfaceTexels
 
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
 FLATNESS = 0.1  # standard deviation along the normal over the mean tangential one
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
+_CURVATURE, _MAX_LIFT = 0.75, 4e-3  # share of the full tangent-plane lift, and its limit in metres
 _MIRROR_TOLERANCE = 3e-3  # metres between a mirrored vertex and the vertex it stands for
 
 
@@ -23,7 +33,8 @@ def surface_texels(
     """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas.
 
     Each splat follows its texel's footprint on the surface, stretched and turned as the atlas is there, so that
-    neighbours overlap wherever the atlas is uneven.
+    neighbours overlap wherever the atlas is uneven. Centres lie on a surface that curves between the vertices, so that
+    the coarse triangles of the scalp leave no corners in an outline.
 
     Args:
         head: the head model.
@@ -37,12 +48,22 @@ def surface_texels(
     binding = uv_texels(head, size)
     neutral = HeadParameters.zeros(head).replace(identity=identity)
     vertices = shaped_vertices(head, neutral, static_offset)
-    points = surface_points(vertices, head.faces, binding)
+    points = _curved(vertices, head.faces, binding, surface_points(vertices, head.faces, binding))
     frames, sides = _texel_frames(head, vertices, binding, points)
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
     quats = _quaternions(frames)
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     return surface, binding
+
+
+def _curved(vertices: Tensor, faces: Tensor, binding: Binding, points: Tensor) -> Tensor:
+    """Phong tessellation: points [M,3] drawn towards the tangent planes of their triangles' corners."""
+    corners = faces[binding.triangle]
+    normals = torch.nn.functional.normalize(vertex_normals(vertices, faces), dim=-1)[corners]
+    height = ((points[:, None] - vertices[corners]) * normals).sum(-1)
+    lift = -(binding.barycentric[..., None] * height[..., None] * normals).sum(1)
+    # Where normals turn by more than a tangent plane can tell (lips, ears), the flat triangle is the better guess.
+    return points + _CURVATURE * lift * (_MAX_LIFT / lift.norm(dim=-1, keepdim=True).clamp_min(_MAX_LIFT))
 
 
 @lru_cache(maxsize=4)

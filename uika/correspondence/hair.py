@@ -24,6 +24,8 @@ RADII = 192
 BENDING, TENSION = 10.0, 0.05  # smoothness of the offset field against the outline's pull
 BACK_PULL = 1e-3
 FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
+EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows as it is, above which not at all
+EAR_RINGS, EAR_ROUNDS = 3, 80
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
 
@@ -50,13 +52,45 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
     )
     canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
     normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
-    height = torch.zeros(len(head.template))
     bald = pose_vertices(head, parameters)
-    for _ in range(ROUNDS):
-        # The cameras carry the pose, so the offset simply adds to the posed head.
-        wanted, pull = _outline_demand(head, bald + height[:, None] * normals, cameras, reach, region)
-        height = _membrane(region, height, wanted, pull)
-    return height[:, None] * normals
+
+    def lift(flat: Tensor) -> Tensor:
+        height = torch.zeros(len(head.template))
+        for _ in range(ROUNDS):
+            # The cameras carry the pose, so the offset simply adds to the posed head.
+            vertices = bald + flat + height[:, None] * normals
+            wanted, pull = _outline_demand(head, vertices, cameras, reach, region)
+            height = _membrane(region, height, wanted, pull)
+        return height
+
+    flat = torch.zeros_like(canonical)
+    height = lift(flat)
+    flat = _covered_ears(head, canonical, height, edges)
+    if bool((flat != 0).any()):
+        height = lift(flat)
+    offset = flat + height[:, None] * normals
+    return offset * (MAX_OFFSET / offset.norm(dim=-1, keepdim=True).clamp(min=MAX_OFFSET))
+
+
+def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Tensor) -> Tensor:
+    """Offset [V,3] that flattens an ear over which hair lies: its relief must not show through."""
+    ears = head.masks["ears"]
+    start, end = edges.T
+    # The mask is hollow where the ear is: close it, then leave out what belongs to the face and the neck.
+    for reduction in ("amax",) * EAR_RINGS + ("amin",) * (EAR_RINGS - 1):
+        ears = ears.scatter_reduce(0, start, ears[end], reduction)
+    ears = ears * (1 - head.masks["face"]) * (1 - head.masks["neck"])
+    degree = torch.zeros_like(ears).index_add(0, start, torch.ones_like(ears[end]))[:, None].clamp(min=1)
+    smooth = canonical
+    for _ in range(EAR_ROUNDS):
+        mean = torch.zeros_like(smooth).index_add(0, start, smooth[end]) / degree
+        smooth = torch.lerp(smooth, mean, ears[:, None])
+    share = torch.zeros_like(ears)
+    for side in (head.template[:, 0] > 0, head.template[:, 0] <= 0):
+        weight = head.masks["ears"] * side
+        lifted = (weight * height).sum() / weight.sum().clamp(min=1e-6)
+        share = torch.where(side, ((lifted - EAR_BARE) / (EAR_COVERED - EAR_BARE)).clamp(0, 1), share)
+    return share[:, None] * (smooth - canonical)
 
 
 def _edges(head: HeadModel) -> Tensor:
