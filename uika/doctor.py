@@ -36,7 +36,8 @@ def examine() -> list[Finding]:
     findings += [
         _package(module, install_command(module) or "", EXTRAS[module] in ("cli", "photo")) for module in EXTRAS
     ]
-    return [*findings, _llvm(), _threads(), _head()]
+    llvm = _llvm()
+    return [*findings, llvm, _threads(with_llvm=not llvm.remedy), _head()]
 
 
 def _package(module: str, remedy: str, needed: bool = True) -> Finding:
@@ -59,13 +60,17 @@ def _llvm() -> Finding:
     return Finding("LLVM", f"{found} ({os.environ.get(ENV, 'found by Dr.Jit')})")
 
 
-def _threads() -> Finding:
-    try:
-        import drjit
+def _threads(with_llvm: bool) -> Finding:
+    text = f"{os.cpu_count()} cores"
+    if importlib.util.find_spec("torch") is not None:
         import torch
-    except ImportError:
-        return Finding("threads", f"{os.cpu_count()} cores")
-    return Finding("threads", f"{os.cpu_count()} cores, torch {torch.get_num_threads()}, Dr.Jit {drjit.thread_count()}")
+
+        text += f", torch {torch.get_num_threads()}"
+    if with_llvm:
+        import drjit
+
+        text += f", Dr.Jit {drjit.thread_count()}"
+    return Finding("threads", text)
 
 
 def _head() -> Finding:
