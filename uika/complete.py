@@ -49,9 +49,11 @@ def suppose(
     """
     labels = binding.from_map(regions(head, binding)[None])[:, 0]
     seen = binding.from_map(known[None])[:, 0] * (labels == 0)
-    # Ears are seen between strands of hair: they take colour but give none.
-    if "ears" in head.masks:
-        seen = seen * (1 - _share(head, binding, "ears"))
+    # Ears are seen between strands of hair, and of the lids of an open eye only shadow and lashes show: these parts
+    # take colour but give none.
+    for name in ("ears", "eyes"):
+        if name in head.masks:
+            seen = seen * (1 - _share(head, binding, name))
     hair = _hairiness(head, static_offset)
     vertices = _continue(head, *_to_vertices(head, binding, binding.from_map(color), seen), hair)
     result = (vertices[head.faces[binding.triangle]] * binding.barycentric[..., None]).sum(1)
@@ -77,12 +79,15 @@ def _to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: Tensor)
 
 
 def _hairiness(head: HeadModel, static_offset: Tensor) -> Tensor:
-    """How far each vertex [V] belongs to hair rather than skin, in [0,1]: where hair stands off, or the upper scalp."""
+    """How far each vertex [V] belongs to hair rather than skin, in [0,1]: the scalp and where hair stands off it.
+
+    Below the jaw joint it fades to skin, which is reached at the height of the neck joint.
+    """
     hair = (static_offset.norm(dim=-1) / _HAIR_DEPTH).clamp_max(1)
     if "scalp" in head.masks:
-        neck, jaw = head.joints[1:3, 1]
-        hair = torch.maximum(hair, head.masks["scalp"] * ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1))
-    return hair
+        hair = torch.maximum(hair, head.masks["scalp"])
+    neck, jaw = head.joints[1:3, 1]
+    return hair * ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1)
 
 
 def _continue(head: HeadModel, color: Tensor, seen: Tensor, hair: Tensor) -> Tensor:

@@ -175,5 +175,5 @@ def _counted(count: int, progress: bool) -> Iterable[int]:
         from tqdm import tqdm
     except ModuleNotFoundError as error:
         raise UikaError(f"the progress bar needs tqdm; run: {install_command('tqdm')}") from error
-    bar: Any = tqdm(range(count), desc="frames", unit="frame", leave=False)
+    bar: Any = tqdm(range(count), desc="frames", unit="frame", leave=False, disable=None)
     return bar
