@@ -34,8 +34,8 @@ def blend_backward(
     features: int,
     grad_features: Any,  # [H * W * F]
     grad_coverage: Any | None,  # [H * W]
-    moments: Any,  # [N * MOMENTS], added to
-    grad_values: Any,  # [N * power_of_two(F)], added to
+    moments: Any,  # [>= N * MOMENTS], added to
+    grad_values: Any,  # [>= N * power_of_two(F)], added to
     settings: Settings,
 ) -> None:
     """Add the gradients of one chunk of features to `moments` and `grad_values`.

@@ -119,6 +119,16 @@ class Splat(torch.autograd.Function):
         return (None, None, *(g if w else None for g, w in zip(grads, wanted, strict=True)))
 
 
+def _capacity(n: int) -> int:
+    """A size of at least `n`, at most a quarter more, that takes few values.
+
+    Expanded scatter-additions compile the size of their target into the kernel, so exact sizes would recompile the
+    backward pass for every new number of splats.
+    """
+    step = max(256, power_of_two(n) // 8)
+    return -(-n // step) * step
+
+
 def _backward(
     trace: Trace, saved: tuple[Tensor, ...], grad_sums: Tensor, grad_coverage: Tensor, settings: Settings, wanted: Any
 ) -> tuple[Tensor | None, ...]:
@@ -127,13 +137,13 @@ def _backward(
     J = be.plain
     n, columns = saved[4].shape
     features = columns + int(settings.has_depth)
-    moments = dr.zeros(J.Float, n * MOMENTS)
+    moments = dr.zeros(J.Float, _capacity(n) * MOMENTS)
     grad_colors = None
     grad_depth = None
     parts = []
     for first, count, records, image in trace.chunks:
         chunk = grad_sums if count == features else grad_sums[..., first : first + count].contiguous()
-        values = dr.zeros(J.Float, n * power_of_two(count))
+        values = dr.zeros(J.Float, _capacity(n) * power_of_two(count))
         blend_backward(
             be,
             records,
@@ -151,7 +161,7 @@ def _backward(
         if first + count > columns:
             i = dr.arange(J.UInt32, n)
             grad_depth = dr.gather(J.Float, values, size * i + count - 1)
-        parts.append(values.torch().view(n, size)[:, : min(count, columns - first)])
+        parts.append(values.torch().view(-1, size)[:n, : min(count, columns - first)])
     if wanted[4]:
         grad_colors = torch.cat(parts, dim=1)
     camera = _project.read_camera(be, saved[5], saved[6], settings)

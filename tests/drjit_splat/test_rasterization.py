@@ -89,16 +89,16 @@ def test_spherical_harmonics(degree: int) -> None:
 
 
 def test_wide_depth_range_keeps_the_order() -> None:
-    scene = random_scene(count=3000)
+    scene = random_scene(count=1200)
     g = torch.Generator().manual_seed(2)
-    depth = 0.5 * 64 ** torch.rand(3000, generator=g)
+    depth = 0.5 * 64 ** torch.rand(1200, generator=g)
     # Half of the splats come in pairs one rounding step apart, which a shortened sort key would merge.
     depth[1::2] = torch.nextafter(depth[::2], torch.tensor(100.0))
     scene["viewmats"] = torch.eye(4)[None]
     scene["means"] = torch.cat([scene["means"][:, :2] * depth[:, None] * 0.5, depth[:, None]], -1)
     scene["scales"] = scene["scales"] * depth[:, None]
-    order = torch.randperm(3000, generator=g)
-    shuffled = {k: v[order] if len(v) == 3000 else v for k, v in scene.items()}
+    order = torch.randperm(1200, generator=g)
+    shuffled = {k: v[order] if len(v) == 1200 else v for k, v in scene.items()}
     assert depth.max() / depth.min() > 30
     image = rasterization(**scene, width=64, height=64)[0]
     assert torch.equal(image, rasterization(**shuffled, width=64, height=64)[0])
