@@ -9,10 +9,12 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from uika.model import PRESETS, BackboneConfig, Reconstructor
+from uika.model import PRESETS, BackboneConfig, EstimatorConfig, Reconstructor
 from uika.model.backbone import VisionTransformer
+from uika.model.estimator import Aggregator
 from uika.model.fusion import Encoder
 from uika.model.mm_block import MMBlock
+from uika.model.uv_head import UvHead
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 
@@ -76,6 +78,31 @@ def test_encoder_and_its_fusion_heads() -> None:
         torch.testing.assert_close(encoder.uv_fusion_head(maps), data["out/uv_head_from_feats"], **TOLERANCE)
         torch.testing.assert_close(encoder.screen(image), data["out/screen"], **TOLERANCE)
         torch.testing.assert_close(encoder.uv(image), data["out/uv"], **TOLERANCE)
+
+
+def test_estimator_aggregator() -> None:
+    weights, data = load("aggregator")
+    backbone = BackboneConfig(dim=64, depth=2, heads=4, taps=(1,))
+    aggregator = Aggregator(EstimatorConfig(backbone=backbone, heads=4, channels=(8, 8, 8, 8), features=8))
+    fit(aggregator, weights)
+    with torch.no_grad():
+        features = aggregator.features(data["in/images"])
+        outputs = aggregator.exchange(features)
+    tokens = features.flatten(0, 1).flatten(2).transpose(1, 2)
+    torch.testing.assert_close(tokens, data["out/patch_tokens"], **TOLERANCE)
+    for index, output in enumerate(outputs):
+        torch.testing.assert_close(output, data[f"out/out.{index}"], **TOLERANCE)
+
+
+@pytest.mark.parametrize(("suffix", "grid"), [("", (4, 4)), ("_rect", (4, 6))])
+def test_estimator_head(suffix: str, grid: tuple[int, int]) -> None:
+    weights, data = load("dpt_head_fuvt")
+    backbone = BackboneConfig(dim=16, depth=1, heads=1, taps=(0,))
+    head = UvHead(EstimatorConfig(backbone=backbone, heads=1, channels=(8, 16, 24, 24), features=16))
+    fit(head, weights)
+    with torch.no_grad():
+        uv = head([data[f"in/tokens{suffix}.{index}"] for index in range(4)], grid)
+    torch.testing.assert_close(uv.permute(0, 1, 3, 4, 2), data[f"out/uv{suffix}"], **TOLERANCE)
 
 
 def test_paper_preset_has_the_released_names_and_shapes() -> None:

@@ -16,6 +16,15 @@ from uika.model.config import BackboneConfig
 
 _ROPE_BASE = 100.0
 _NORM_EPS = 1e-5
+# Statistics of ImageNet, which pretrained backbones expect.
+_MEAN = (0.485, 0.456, 0.406)
+_STD = (0.229, 0.224, 0.225)
+
+
+def standardize(images: Tensor) -> Tensor:
+    """Images [...,3,H,W] in [0,1] -> zero mean and unit deviation over natural images."""
+    mean, std = (images.new_tensor(values)[:, None, None] for values in (_MEAN, _STD))
+    return (images - mean) / std
 
 
 class RotaryPositions(nn.Module):

@@ -63,6 +63,24 @@ class GaussianConfig:
 
 
 @dataclass(frozen=True)
+class EstimatorConfig:
+    """The facial correspondence estimator (paper section 3.1, supplement A.1).
+
+    backbone      its last tap alone is read
+    layers        number of pairs of a frame block and a global block, one decoder level each
+    heads         attention heads of those blocks
+    channels      of the four decoder levels
+    features      inner channels of the decoder
+    """
+
+    backbone: BackboneConfig
+    heads: int
+    channels: tuple[int, int, int, int]
+    features: int
+    layers: int = 4
+
+
+@dataclass(frozen=True)
 class ModelConfig:
     """Architecture of a `Reconstructor`.
 
@@ -198,5 +216,26 @@ PRESETS: dict[str, ModelConfig] = {
         mlp_width=512,
         uv=UvConfig(grid="corners", normalization="max", oversample=1, close_radius=0, fill=False),
         gaussians=GaussianConfig(relative=False),
+    ),
+}
+
+ESTIMATORS: dict[str, EstimatorConfig] = {
+    "tiny": EstimatorConfig(
+        backbone=BackboneConfig(dim=192, depth=4, heads=6, taps=(3,), layer_scale=0.1),
+        heads=6,
+        channels=(48, 64, 96, 96),
+        features=56,
+    ),
+    "base": EstimatorConfig(
+        backbone=BackboneConfig(dim=384, depth=12, heads=6, taps=(11,), frozen=True),
+        heads=6,
+        channels=(96, 192, 384, 384),
+        features=128,
+    ),
+    "paper": EstimatorConfig(
+        backbone=BackboneConfig(dim=768, depth=12, heads=12, taps=(11,), layer_scale=1e-5, frozen=True),
+        heads=12,
+        channels=(256, 512, 1024, 1024),
+        features=256,
     ),
 }

@@ -10,34 +10,42 @@ from uika.model.config import ModelConfig
 
 
 class ResidualConvUnit(nn.Module):
-    """x + conv(relu(conv(relu(x))))."""
+    """x + conv(relu(conv(relu(x)))), or with `rectified` relu(x) + the same."""
 
-    def __init__(self, features: int) -> None:
-        """Keeps `features` channels."""
+    def __init__(self, features: int, rectified: bool = False) -> None:
+        """Keeps `features` channels; `rectified` is how the released estimator adds (its ReLU works in place)."""
         super().__init__()
+        self.rectified = rectified
         self.conv1 = nn.Conv2d(features, features, 3, padding=1)
         self.conv2 = nn.Conv2d(features, features, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """[B,C,h,w]."""
-        return x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
+        positive = functional.relu(x)
+        return (positive if self.rectified else x) + self.conv2(functional.relu(self.conv1(positive)))
 
 
 class RefineBlock(nn.Module):
     """Adds a finer level to the running map, refines and enlarges it."""
 
-    def __init__(self, features: int, deepest: bool) -> None:
-        """The deepest block starts the running map and takes no skip."""
+    def __init__(self, features: int, deepest: bool, released_estimator: bool = False) -> None:
+        """The deepest block starts the running map and takes no skip.
+
+        `released_estimator`: rectified skips and corner-aligned resizing, as the released estimator has it and the
+        released decoder has not.
+        """
         super().__init__()
-        self.resConfUnit1 = None if deepest else ResidualConvUnit(features)
-        self.resConfUnit2 = ResidualConvUnit(features)
+        self.corners = released_estimator
+        self.resConfUnit1 = None if deepest else ResidualConvUnit(features, released_estimator)
+        self.resConfUnit2 = ResidualConvUnit(features, released_estimator)
         self.out_conv = nn.Conv2d(features, features, 1)
 
     def forward(self, x: Tensor, skip: Tensor | None, size: tuple[int, int]) -> Tensor:
         """x [B,C,h,w], skip of the same shape or None -> [B,C,*size]."""
         if self.resConfUnit1 is not None and skip is not None:
             x = x + self.resConfUnit1(skip)
-        x = resize(self.resConfUnit2(x), size)
+        x = self.resConfUnit2(x)
+        x = resize_corners(x, size) if self.corners else resize(x, size)
         return self.out_conv(x)
 
 
@@ -46,6 +54,23 @@ def resize(x: Tensor, size: tuple[int, int], antialias: bool = False) -> Tensor:
     if tuple(x.shape[-2:]) == size:
         return x
     return functional.interpolate(x, size=size, mode="bilinear", align_corners=False, antialias=antialias)
+
+
+def resize_corners(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """Bilinear with the corner pixels of both grids aligned."""
+    return functional.interpolate(x, size=size, mode="bilinear", align_corners=True)
+
+
+def resize_layers(channels: tuple[int, int, int, int]) -> nn.ModuleList:
+    """Bring four maps of one grid to four times, twice, once and half its size."""
+    return nn.ModuleList(
+        [
+            nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
+            nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2),
+            nn.Identity(),
+            nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
+        ]
+    )
 
 
 class UvDpt(nn.Module):
@@ -59,14 +84,7 @@ class UvDpt(nn.Module):
         self.grid = config.token_grid
         self.aggregation = config.aggregation
         self.projects = nn.ModuleList(nn.Conv2d(config.dim, width, 1) for width in channels)
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
-                nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2),
-                nn.Identity(),
-                nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
-            ]
-        )
+        self.resize_layers = resize_layers(channels)
         self.layer_rn = nn.ModuleList(
             nn.Conv2d(width + observed, features, 3, padding=1, bias=False) for width in channels
         )

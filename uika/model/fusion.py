@@ -5,12 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from uika.model.backbone import VisionTransformer
+from uika.model.backbone import VisionTransformer, standardize
 from uika.model.config import ModelConfig
-
-# Statistics of ImageNet, which pretrained backbones expect.
-_MEAN = (0.485, 0.456, 0.406)
-_STD = (0.229, 0.224, 0.225)
 
 
 class FusionHead(nn.Module):
@@ -49,8 +45,7 @@ class Encoder(nn.Module):
         return None if self.uv_fusion_head is None else self._encode(images, self.uv_fusion_head)
 
     def _encode(self, images: Tensor, head: FusionHead) -> Tensor:
-        mean, std = (images.new_tensor(values)[:, None, None] for values in (_MEAN, _STD))
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            maps = self.model((images.flatten(0, 1) - mean) / std)
+            maps = self.model(standardize(images.flatten(0, 1)))
         tokens = head(maps).flatten(2).transpose(1, 2)
         return tokens.reshape(images.shape[0], -1, tokens.shape[-1])
