@@ -1,8 +1,8 @@
 """Mitsuba reference renders of the parametric head; importing this package does not load Mitsuba."""
 
 from scenes.compare import SplatReport, compare_splats
-from scenes.exr import read_exr, write_exr
+from scenes.exr import read_exr, write_exr, write_png
 from scenes.render import AOVS, render
 from scenes.variant import load_mitsuba
 
-__all__ = ["AOVS", "SplatReport", "compare_splats", "load_mitsuba", "read_exr", "render", "write_exr"]
+__all__ = ["AOVS", "SplatReport", "compare_splats", "load_mitsuba", "read_exr", "render", "write_exr", "write_png"]

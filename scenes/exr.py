@@ -10,14 +10,21 @@ from types import ModuleType
 
 import numpy as np
 
-_CHANNELS = {"rgb": ("R", "G", "B"), "mask": ("A",), "depth": ("Z",), "uv": ("uv.U", "uv.V")}
+_CHANNELS = {
+    "linear": ("R", "G", "B"),
+    "rgb": ("srgb.R", "srgb.G", "srgb.B"),
+    "mask": ("A",),
+    "depth": ("Z",),
+    "normal": ("normal.X", "normal.Y", "normal.Z"),
+    "uv": ("uv.U", "uv.V"),
+}
 
 
 def write_exr(path: str | Path, images: Mapping[str, np.ndarray]) -> None:
     """Write images [H,W] or [H,W,C] as float32 channels; the file appears whole or not at all.
 
-    "rgb", "mask", "depth" and "uv" become R G B, A, Z and uv.U uv.V; any other image becomes channels `name.0`,
-    `name.1`, ... Values are stored as they are, so "rgb" from `render` stays sRGB.
+    "linear", "mask" and "depth" become R G B, A and Z as viewers expect them; "rgb", which is sRGB, "normal" and "uv"
+    become channels of their own name, and any other image `name.0`, `name.1`, ... Values are stored as they are.
 
     Raises:
         ValueError: there are no images, or they differ in size.
@@ -73,3 +80,24 @@ def _openexr() -> ModuleType:
     except ImportError as error:
         raise ImportError("EXR files need OpenEXR: install the extra with `pip install uika-drjit[scenes]`") from error
     return OpenEXR
+
+
+def write_png(path: str | Path, image: np.ndarray) -> None:
+    """Write an sRGB image [H,W,3] or a mask [H,W] with values in [0,1] as 8-bit PNG, whole or not at all.
+
+    Raises:
+        ValueError: the image has another shape.
+    """
+    from PIL import Image
+
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[-1] not in (1, 3)):
+        raise ValueError(f"image has shape {image.shape}; [H,W] or [H,W,3] is needed")
+    target = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".png")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            levels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+            Image.fromarray(levels.squeeze()).save(file, format="PNG")
+        Path(temporary).replace(target)
+    finally:
+        Path(temporary).unlink(missing_ok=True)

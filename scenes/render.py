@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
+from scenes.people.glasses import Glasses
 from scenes.stage import Light, Stage, load_stage
 from scenes.variant import FAST_VARIANT, load_mitsuba
 from uika.head import Camera, HeadModel
 
-AOVS = ("rgb", "mask", "depth", "uv", "triangle")
-_TRACED = ("depth", "uv", "triangle")
+AOVS = ("rgb", "linear", "mask", "depth", "normal", "uv", "triangle")
+_TRACED = ("depth", "normal", "uv", "triangle")
 
 
 def render(
@@ -27,6 +28,8 @@ def render(
     *,
     integrator: Literal["direct", "path"] = "direct",
     background: Sequence[float] = (1.0, 1.0, 1.0),
+    roughness: torch.Tensor | np.ndarray | None = None,
+    glasses: Glasses | None = None,
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
     """Render a head mesh with Mitsuba; only what `aovs` names is traced.
@@ -39,15 +42,19 @@ def render(
             skin tone.
         aovs: names out of `AOVS`.
         spp: samples per pixel of colour and mask.
-        light: "studio" (soft room and three lamps) or "flat" (the texture's own colour, unlit).
+        light: "studio" (soft room and three lamps), "environment" (a sky), "side" (one hard lamp), "portrait" (one
+            large lamp and a backdrop, which fills the frame behind the head) or "flat" (the texture's own colour, unlit).
         integrator: "direct" (one bounce) or "path".
         background: sRGB colour behind the head.
+        roughness: UV map [S,S] in [0,1]; None for an even one.
+        glasses: what the head wears; no label shows it.
         seed: of the sampler; the same seed gives the same image.
 
     Returns:
-        For each name asked for: "rgb" [H,W,3] sRGB in [0,1]; "mask" [H,W] coverage in [0,1]; and, taken exactly at
-        pixel centres so that values are never mixed at outlines, "depth" [H,W] camera z in metres (0 for none),
-        "uv" [H,W,2] with v down (0 for none) and "triangle" [H,W] int64 (-1 for none).
+        For each name asked for: "rgb" [H,W,3] sRGB in [0,1]; "linear" [H,W,3] radiance, multiplied by the mask; "mask"
+        [H,W] coverage in [0,1] (under "portrait" 0 or 1 at pixel centres); and, taken exactly at pixel centres so that
+        values are never mixed at outlines, "depth" [H,W] camera z in metres (0 for none), "normal" [H,W,3] of the
+        triangle in world space, towards the camera (0), "uv" [H,W,2] with v down (0) and "triangle" [H,W] int64 (-1).
 
     Raises:
         ValueError: an argument does not fit; the message names it.
@@ -60,13 +67,19 @@ def render(
     _check_camera(camera)
     albedo = None if texture is None else srgb_to_linear(_texture_array(texture))
     stage = load_stage(head, camera.width, camera.height, light, integrator)
-    stage.update(head, points, camera, albedo)
+    stage.update(
+        head, points, camera, albedo, None if roughness is None else np.asarray(roughness, np.float32), glasses
+    )
     images: dict[str, np.ndarray] = {}
-    if "rgb" in aovs or "mask" in aovs:
-        colour, images["mask"] = _radiance(stage, spp, seed, with_colour="rgb" in aovs)
-        images["rgb"] = _composite(colour, images["mask"], background)
-    if any(name in aovs for name in _TRACED):
+    backdrop = light == "portrait"
+    with_colour = "rgb" in aovs or "linear" in aovs
+    if with_colour or ("mask" in aovs and not backdrop):
+        images["linear"], images["mask"] = _radiance(stage, spp, seed, with_colour)
+        images["rgb"] = _composite(images["linear"], images["mask"], background)
+    if any(name in aovs for name in _TRACED) or (backdrop and "mask" in aovs):
         images.update(_centre_hits(stage, camera))
+    if backdrop and "mask" in aovs:
+        images["mask"] = (images["triangle"] >= 0).astype(np.float32)
     return {name: images[name] for name in aovs}
 
 
@@ -109,23 +122,19 @@ def _centre_hits(stage: Stage, camera: Camera) -> dict[str, np.ndarray]:
     ray, _ = stage.sensor.sample_ray(0.0, 0.0, position, mi.Point2f(0.5))
     hit = stage.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, coherent=True)
     found = hit.is_valid()
-    if stage.light == "studio":
-        found &= hit.shape == _head_shape(stage)
+    found &= hit.shape == mi.ShapePtr(stage.shape("head"))
     forward = mi.Vector3f(*camera.viewmat[2, :3].double().tolist())
     z = dr.dot(forward, hit.p) + float(camera.viewmat[2, 3])
     depth, u, v = (dr.select(found, value, 0.0) for value in (z, hit.uv.x, hit.uv.y))
     triangle = dr.select(found, mi.Int32(hit.prim_index), -1)
-    dr.eval(depth, u, v, triangle)
+    normal = dr.select(found, dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), 0.0)
+    dr.eval(depth, u, v, triangle, normal)
     return {
+        "normal": np.array(normal).T.reshape(height, width, 3),
         "depth": np.array(depth).reshape(height, width),
         "uv": np.stack((np.array(u), np.array(v)), -1).reshape(height, width, 2),
         "triangle": np.array(triangle).astype(np.int64).reshape(height, width),
     }
-
-
-def _head_shape(stage: Stage) -> Any:
-    mi = load_mitsuba()
-    return mi.ShapePtr(next(shape for shape in stage.scene.shapes() if shape.id() == "head"))
 
 
 def _check_vertices(vertices: torch.Tensor | np.ndarray, head: HeadModel) -> torch.Tensor:

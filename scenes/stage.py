@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,15 +14,18 @@ import numpy as np
 import torch
 
 from scenes.geometry import SeamMesh, cut_seams
+from scenes.people.glasses import Glasses, glasses_topology
 from scenes.variant import load_mitsuba
 from uika.head import Camera, HeadModel
 
-Light = Literal["studio", "flat"]
-LIGHTS = ("studio", "flat")
+Light = Literal["studio", "environment", "flat", "side", "portrait"]
+LIGHTS = ("studio", "environment", "flat", "side", "portrait")
 INTEGRATORS = ("direct", "path")
-_FOLDER = Path(__file__).parent
-_TEXTURE_KEYS = {"studio": "bsdf.brdf_0.base_color.data", "flat": "emitter.radiance.data"}
+_FOLDER = Path(__file__).parent / "library"
+_BSDF = "head.bsdf.brdf_0"
 _DEFAULT_ALBEDO = (0.55, 0.36, 0.28)  # linear; an even skin tone
+_DEFAULT_ROUGHNESS = 0.55
+_SKY = ((0.95, 1.0, 1.1), (0.35, 0.33, 0.3))  # linear radiance at the zenith and below the horizon
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,20 +42,70 @@ class Stage:
         """The scene's only sensor."""
         return self.scene.sensors()[0]
 
-    def update(self, head: HeadModel, vertices: torch.Tensor, camera: Camera, texture: np.ndarray | None) -> None:
-        """Set head vertices [V,3] in metres, camera, and linear texture [S,S,3] (None for an even skin tone)."""
-        mi = load_mitsuba()
+    def shape(self, name: str) -> Any | None:
+        """The shape of that name; None where the scene has none."""
+        return next((shape for shape in self.scene.shapes() if shape.id() == name), None)
+
+    def update(
+        self,
+        head: HeadModel,
+        vertices: torch.Tensor,
+        camera: Camera,
+        texture: np.ndarray | None,
+        roughness: np.ndarray | None = None,
+        glasses: Glasses | None = None,
+    ) -> None:
+        """Set vertices [V,3] in metres, camera, linear texture [S,S,3] and roughness [S,S]; None for even skin."""
+        self.dress(texture, roughness)
+        self._aim(camera)
+        self.pose(head, vertices, camera.position, glasses)
+
+    def dress(self, texture: np.ndarray | None, roughness: np.ndarray | None) -> None:
+        """Set linear colours [S,S,3] and roughness [S,S] in [0,1], None for even ones; takes effect with `pose`."""
         albedo = np.full((2, 2, 3), _DEFAULT_ALBEDO, np.float32) if texture is None else texture
-        arrays = {"vertex_positions": self.mesh.positions(vertices).ravel(), _TEXTURE_KEYS[self.light]: albedo}
-        if "head.vertex_normals" in self.params:
-            arrays["vertex_normals"] = self.mesh.normals(vertices, head.faces, camera.position).ravel()
-        for name, value in arrays.items():
-            key = f"head.{name}"
-            self.params[key] = type(self.params[key])(np.ascontiguousarray(value, np.float32))
+        if self.light == "flat":
+            self._set("head.emitter.radiance.data", albedo)
+            return
+        rough = np.full((2, 2), _DEFAULT_ROUGHNESS, np.float32) if roughness is None else roughness
+        self._set(f"{_BSDF}.base_color.data", albedo)
+        self._set(f"{_BSDF}.roughness.data", rough[..., None])
+
+    def pose(
+        self,
+        head: HeadModel,
+        vertices: torch.Tensor,
+        eye: torch.Tensor | None = None,
+        glasses: Glasses | None = None,
+    ) -> None:
+        """Set head vertices [V,3] in metres and glasses, shaded for a viewer at `eye` [3], and apply all changes."""
+        self._set("head.vertex_positions", self.mesh.positions(vertices))
+        if eye is not None and "head.vertex_normals" in self.params:
+            self._set("head.vertex_normals", self.mesh.normals(vertices, head.faces, eye))
+        if "glasses.vertex_positions" in self.params:
+            hidden = vertices.mean(0).expand(len(glasses_topology()[0]), 3).numpy()
+            self._set("glasses.vertex_positions", hidden if glasses is None else glasses.points)
+        self.params.update()
+
+    def set_lights(self, values: Mapping[str, Any]) -> None:
+        """Set numbers, colours and pictures of the scene's lamps by their `mi.traverse` names; applied with `pose`."""
+        for name, value in values.items():
+            if name not in self.params:
+                raise ValueError(f"the scene '{self.light}' has no parameter '{name}'")
+            if isinstance(value, np.ndarray):
+                self._set(name, value)
+            else:
+                _assign(self.params, name, value)
+
+    def _aim(self, camera: Camera) -> None:
+        mi = load_mitsuba()
         for name, number in _sensor_values(camera).items():
             _assign(self.params, f"sensor.{name}", number)
         _assign(self.params, "sensor.to_world", mi.ScalarTransform4f(_sensor_to_world(camera)))
-        self.params.update()
+
+    def _set(self, key: str, array: np.ndarray) -> None:
+        kind = type(self.params[key])
+        values = np.ascontiguousarray(array, np.float32)
+        self.params[key] = kind(values if kind.__name__.startswith("Tensor") else values.ravel())
 
 
 @lru_cache(maxsize=8)
@@ -68,19 +122,34 @@ def load_stage(head: HeadModel, width: int, height: int, light: Light, integrato
     mi = load_mitsuba()
     mesh = cut_seams(head)
     # Scene files take meshes and textures by file name only; the files are read at once and can go.
-    with tempfile.TemporaryDirectory() as folder:
-        mesh_file, texture_file = Path(folder) / "head.ply", Path(folder) / "texture.exr"
-        _write_mesh(mi, mesh, head.template.numpy()[mesh.source], mesh_file)
-        mi.Bitmap(np.full((2, 2, 3), _DEFAULT_ALBEDO, np.float32)).write(str(texture_file))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        files = {"mesh": folder / "head.ply", "texture": folder / "texture.exr"}
+        _write_mesh(mi, head.template.numpy()[mesh.source], mesh.faces, mesh.texcoords, files["mesh"])
+        mi.Bitmap(np.full((2, 2, 3), _DEFAULT_ALBEDO, np.float32)).write(str(files["texture"]))
+        if light != "flat":
+            files |= {"glasses": folder / "glasses.ply", "roughness": folder / "roughness.exr"}
+            _write_mesh(mi, *glasses_topology(), None, files["glasses"])
+            mi.Bitmap(np.full((2, 2, 1), _DEFAULT_ROUGHNESS, np.float32)).write(str(files["roughness"]))
+        if light == "environment":
+            files["environment"] = folder / "environment.exr"
+            mi.Bitmap(plain_sky()).write(str(files["environment"]))
         scene = mi.load_file(
             str(_FOLDER / f"{light}.xml"),
-            mesh=str(mesh_file),
-            texture=str(texture_file),
             width=str(width),
             height=str(height),
             integrator=integrator,
+            **{key: str(path) for key, path in files.items()},
         )
     return Stage(scene, mi.traverse(scene), mesh, light)
+
+
+def plain_sky(height: int = 32) -> np.ndarray:
+    """A bright upper and a darker lower half as a latitude-longitude picture [H,2H,3], linear."""
+    up = np.cos(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
+    share = 1 / (1 + np.exp(-4 * up))
+    picture = share * np.array(_SKY[0]) + (1 - share) * np.array(_SKY[1])
+    return np.ascontiguousarray(np.broadcast_to(picture, (height, 2 * height, 3)), np.float32)
 
 
 def _assign(params: Any, key: str, value: Any) -> None:
@@ -90,15 +159,14 @@ def _assign(params: Any, key: str, value: Any) -> None:
     params.set_property(target, kind, value)
 
 
-def _write_mesh(mi: Any, mesh: SeamMesh, positions: np.ndarray, path: Path) -> None:
-    shape = mi.Mesh("head", len(positions), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=True)
+def _write_mesh(mi: Any, positions: np.ndarray, faces: np.ndarray, texcoords: np.ndarray | None, path: Path) -> None:
+    shape = mi.Mesh(
+        "mesh", len(positions), len(faces), has_vertex_normals=True, has_vertex_texcoords=texcoords is not None
+    )
     params = mi.traverse(shape)
-    arrays = {
-        "vertex_positions": positions,
-        "vertex_normals": np.zeros_like(positions),
-        "vertex_texcoords": mesh.texcoords,
-        "faces": mesh.faces,
-    }
+    arrays = {"vertex_positions": positions, "vertex_normals": np.zeros_like(positions), "faces": faces}
+    if texcoords is not None:
+        arrays["vertex_texcoords"] = texcoords
     for key, value in arrays.items():
         params[key] = type(params[key])(np.ascontiguousarray(value).ravel())
     params.update()
