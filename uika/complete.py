@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from uika.head import Binding, HeadModel
+from uika.strands import strands
 
 # sRGB colours under even light of parts that lids and lips hide: no skin may appear there when they open.
 _HIDDEN = {"eyeballs": (0.75, 0.71, 0.69), "mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
@@ -48,6 +49,7 @@ def suppose(
         [3,S,S], NaN outside the atlas.
     """
     labels = binding.from_map(regions(head, binding)[None])[:, 0]
+    observed = binding.from_map(color)
     seen = binding.from_map(known[None])[:, 0] * (labels == 0)
     # Ears are seen between strands of hair, and of the lids of an open eye only shadow and lashes show: these parts
     # take colour but give none.
@@ -55,15 +57,23 @@ def suppose(
         if name in head.masks:
             seen = seen * (1 - _share(head, binding, name))
     hair = _hairiness(head, static_offset)
-    vertices = _continue(head, *_to_vertices(head, binding, binding.from_map(color), seen), hair)
-    result = (vertices[head.faces[binding.triangle]] * binding.barycentric[..., None]).sum(1)
+    vertices = _continue(head, *_to_vertices(head, binding, observed, seen), hair)
+    result = _mixed(head, binding, vertices)
+    points = _mixed(head, binding, head.template)
+    hairy = _mixed(head, binding, hair[:, None])[:, 0] * (labels == 0)
+    result = (result + strands(points, observed, result, seen, hairy)).clamp(0, 1)
     for index, name in enumerate(_REGIONS):
         result[labels == index + 1] = brightness * torch.tensor(_HIDDEN[name])
     return binding.to_map(result, fill=torch.nan)
 
 
+def _mixed(head: HeadModel, binding: Binding, values: Tensor) -> Tensor:
+    """Vertex values [V,C] at the texels [M,C]."""
+    return (values[head.faces[binding.triangle]] * binding.barycentric[..., None]).sum(1)
+
+
 def _share(head: HeadModel, binding: Binding, name: str) -> Tensor:
-    return (head.masks[name][head.faces[binding.triangle]] * binding.barycentric).sum(1)
+    return _mixed(head, binding, head.masks[name][:, None])[:, 0]
 
 
 def _to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
