@@ -10,7 +10,6 @@ EXTRAS = {
     "tyro": "cli",
     "mediapipe": "photo",
     "pillow_heif": "photo",
-    "pymatting": "photo",
     "scipy": "photo",
     "mitsuba": "scenes",
     "OpenEXR": "scenes",
