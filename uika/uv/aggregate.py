@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from uika.uv.holes import close_holes
-from uika.uv.reproject import Grid, accumulate, mean_color
+from uika.uv.reproject import Grid, Sums, accumulate, mean_color
 
 Normalization = Literal["minmax", "max"]
 
@@ -43,6 +43,14 @@ def aggregate(
     the released model. With "minmax", equal counts everywhere give 1 if they are positive and 0 if nothing was seen.
     """
     sums = accumulate(images, uv, masks, size, grid, weights, oversample=oversample)
+    return pool(sums, normalization=normalization, close_radius=close_radius, valid=valid)
+
+
+@torch.no_grad()
+def pool(
+    sums: Sums, *, normalization: Normalization = "minmax", close_radius: int = 0, valid: Tensor | None = None
+) -> Aggregate:
+    """The result of `aggregate` from the sums of `accumulate`, whose views may come from different calls."""
     weight, samples = sums.weight.sum(dim=1), sums.samples.sum(dim=1)
     rgb = mean_color(sums.color.sum(dim=1), weight).float()
     trust = mean_color(weight, samples).float()

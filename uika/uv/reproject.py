@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -40,8 +40,12 @@ def reproject(
     Arguments as in `accumulate`; `close_radius` (texels) closes pinholes with `close_holes`.
     Returns colours [B,V,3,S,S] (0 where nothing was hit) and the hit weight [B,V,1,S,S] in pixels, both float32.
     """
-    sums = accumulate(images, uv, masks, size, grid, weights, oversample=oversample)
-    batch, views = images.shape[:2]
+    return view_images(accumulate(images, uv, masks, size, grid, weights, oversample=oversample), close_radius)
+
+
+def view_images(sums: Sums, close_radius: int = 0) -> tuple[Tensor, Tensor]:
+    """The result of `reproject` from the sums of `accumulate`."""
+    batch, views = sums.weight.shape[:2]
     colors = mean_color(sums.color, sums.weight).flatten(0, 1).float()
     weight = sums.weight.flatten(0, 1).float()
     if close_radius > 0:
@@ -54,7 +58,6 @@ def mean_color(color: Tensor, weight: Tensor) -> Tensor:
     return torch.where(weight > 0, color / weight.clamp_min(1e-300), torch.zeros_like(color))
 
 
-@torch.no_grad()
 def accumulate(
     images: Tensor,
     uv: Tensor,
@@ -79,66 +82,85 @@ def accumulate(
 
     No gradient flows through it. Raises ValueError on shapes, sizes or options that do not fit.
     """
-    _check(images, uv, masks, size, grid, weights, oversample)
-    batch, views, _, height, width = images.shape
-    weight = masks.float() if grid == "centers" else (masks > 0).float()
-    if weights is not None:
-        weight = weight * weights
+    return accumulate_sizes(images, uv, masks, (size,), grid, weights, oversample=oversample)[0]
+
+
+@torch.no_grad()
+def accumulate_sizes(
+    images: Tensor,
+    uv: Tensor,
+    masks: Tensor,
+    sizes: Sequence[int],
+    grid: Grid = "centers",
+    weights: Tensor | None = None,
+    *,
+    oversample: int = 1,
+) -> list[Sums]:
+    """`accumulate` for several atlas sizes in one pass over the pixels."""
+    _check(images, uv, masks, min(sizes), grid, weights, oversample)
+    batch, views = images.shape[:2]
+    totals = [torch.zeros(batch * views, 5, size * size, dtype=torch.float64, device=images.device) for size in sizes]
+    for view in range(batch * views):
+        item, index = divmod(view, views)
+        trust = None if weights is None else weights[item, index]
+        table, valid = _table(images[item, index], uv[item, index], masks[item, index], grid, trust)
+        for sample in _samples(table, valid, oversample):
+            payload = torch.cat([sample[2:], torch.ones_like(sample[:1])]).double() / oversample**2
+            for size, total in zip(sizes, totals, strict=True):
+                total[view].scatter_add_(1, _cells(sample[:2], size, grid).expand(5, -1), payload)
+    maps = [total.view(batch, views, 5, size, size) for size, total in zip(sizes, totals, strict=True)]
+    return [Sums(color=parts[:, :, :3], weight=parts[:, :, 3:4], samples=parts[:, :, 4:5]) for parts in maps]
+
+
+def _table(image: Tensor, uv: Tensor, mask: Tensor, grid: Grid, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Rows (u, v, weighted r, g, b, weight) [6,H,W] of one view, and which pixels count [H,W]."""
+    share = mask.float() if grid == "centers" else (mask > 0).float()
+    if weight is not None:
+        share = share * weight
     coords = uv.float() if grid == "centers" else uv.float().clamp(0, 1)
     # Colours are premultiplied so that samples between two pixels follow the trusted one.
-    table = torch.cat([coords, images.float() * weight, weight], dim=2)
-    valid = torch.isfinite(table).all(dim=2) & (weight[:, :, 0] > 0)
-    valid &= ((coords >= 0) & (coords <= 1)).all(dim=2)
-    table = table.permute(0, 1, 3, 4, 2).reshape(-1, 6)
-
-    out = torch.zeros(batch * views * size * size, 5, dtype=torch.float64, device=images.device)
-    for pixel, sample in _samples(table, valid.reshape(-1, height, width), oversample):
-        view = pixel // (height * width)
-        cells = _cells(sample[:, :2], size, grid)
-        payload = torch.cat([sample[:, 2:].double(), torch.ones_like(sample[:, :1])], dim=1) / oversample**2
-        out.index_add_(0, view * size * size + cells, payload)
-    maps = out.reshape(batch, views, size, size, 5).permute(0, 1, 4, 2, 3)
-    return Sums(color=maps[:, :, :3], weight=maps[:, :, 3:4], samples=maps[:, :, 4:5])
+    table = torch.cat([coords, image.float() * share, share])
+    valid = torch.isfinite(table).all(dim=0) & (share[0] > 0) & ((coords >= 0) & (coords <= 1)).all(dim=0)
+    return table, valid
 
 
 def _cells(uv: Tensor, size: int, grid: Grid) -> Tensor:
-    """Row-major texel of uv [P,2]."""
+    """Row-major texel of uv [2,P]."""
     if grid == "centers":
         column_row = (uv * size).floor().long().clamp_(0, size - 1)
     else:
         column_row = torch.round(uv * (size - 1)).long()
-    return column_row[:, 1] * size + column_row[:, 0]
+    return column_row[1] * size + column_row[0]
 
 
-def _samples(table: Tensor, valid: Tensor, oversample: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield (pixel index [P], interpolated rows [P,6]) for each of the k*k positions inside a pixel's cell."""
-    _, height, width = valid.shape
-    flat = valid.reshape(-1)
-    pixel = flat.nonzero()[:, 0]
-    yield pixel, table[pixel]
+def _samples(table: Tensor, valid: Tensor, oversample: int) -> Iterator[Tensor]:
+    """Yield interpolated columns [6,P] for each of the k*k positions inside the pixels' cells."""
+    height, width = valid.shape
+    flat, usable = table.flatten(1), valid.flatten()
+    pixel = usable.nonzero()[:, 0]
+    here = flat.index_select(1, pixel)
+    yield here
     if oversample == 1:
         return
-    right_ok = _linked(table, flat, pixel, 1, pixel % width < width - 1)
-    down_ok = _linked(table, flat, pixel, width, pixel // width % height < height - 1)
-    cell_ok = right_ok & down_ok
-    cell_ok[cell_ok.clone()] = _linked(table, flat, pixel[cell_ok], width + 1, torch.ones_like(pixel[cell_ok]) > 0)
-    right, down, cell = pixel[right_ok], pixel[down_ok], pixel[cell_ok]
-    corners = [table[cell], table[cell + 1], table[cell + width], table[cell + width + 1]]
+    column, row = pixel % width, torch.div(pixel, width, rounding_mode="floor")
+    inside = {1: column < width - 1, width: row < height - 1}
+    inside[width + 1] = inside[1] & inside[width]
+    linked = {}
+    for step, exists in inside.items():
+        other = torch.where(exists, pixel + step, pixel)
+        there = flat.index_select(1, other)
+        close = (there[:2] - here[:2]).abs().amax(dim=0) <= MAX_UV_STEP
+        linked[step] = exists & usable.index_select(0, other) & close
+    right, down = (linked[step].nonzero()[:, 0] for step in (1, width))
+    cell = (linked[1] & linked[width] & linked[width + 1]).nonzero()[:, 0]
     fractions = [step / oversample for step in range(1, oversample)]
+    for chosen, step in ((right, 1), (down, width)):
+        start, end = here.index_select(1, chosen), flat.index_select(1, pixel[chosen] + step)
+        yield from (torch.lerp(start, end, fraction) for fraction in fractions)
+    corners = [flat.index_select(1, pixel[cell] + step) for step in (0, 1, width, width + 1)]
     for x in fractions:
-        yield right, torch.lerp(table[right], table[right + 1], x)
-        yield down, torch.lerp(table[down], table[down + width], x)
-        for y in fractions:
-            top = torch.lerp(corners[0], corners[1], x)
-            bottom = torch.lerp(corners[2], corners[3], x)
-            yield cell, torch.lerp(top, bottom, y)
-
-
-def _linked(table: Tensor, valid: Tensor, pixel: Tensor, step: int, inside: Tensor) -> Tensor:
-    """Whether the pixel `step` further exists, is valid and lies close in UV."""
-    other = torch.where(inside, pixel + step, pixel)
-    close = (table[other, :2] - table[pixel, :2]).abs().amax(dim=1) <= MAX_UV_STEP
-    return inside & valid[other] & close
+        top, bottom = torch.lerp(corners[0], corners[1], x), torch.lerp(corners[2], corners[3], x)
+        yield from (torch.lerp(top, bottom, y) for y in fractions)
 
 
 def _check(
