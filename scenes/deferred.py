@@ -2,8 +2,8 @@
 
 `scenes.render` asks Mitsuba to follow light for each pixel. Here the emitters of the same scene file are sampled only
 at the vertices, with shadows, and the result serves every camera. Each pixel then costs its primary rays alone, which
-also carry the labels. Diffuse light is exact up to the interpolation between vertices; highlights use one mean direction of
-light for each vertex.
+also carry the labels. Diffuse light is exact up to the interpolation between vertices; highlights use one mean
+direction of light for each vertex.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ class Shader:
         texture: Any,
         glasses: Glasses | None = None,
         *,
+        exposure: float = 1.0,
         samples: int = 64,
         seed: int = 0,
     ) -> None:
@@ -77,6 +78,7 @@ class Shader:
             vertices: [V,3] posed vertices, metres.
             texture: from `as_texture`.
             glasses: what the head wears.
+            exposure: factor on all light.
             samples: light samples for each vertex.
             seed: of these samples.
 
@@ -103,6 +105,7 @@ class Shader:
             points = torch.cat((points, worn))
         self._outline = points
         light = gather_light(stage, points, normals, samples, seed)
+        light[:, :3] *= exposure
         corner = np.zeros((len(source), _RECORD), np.float32)
         corner[:, :11] = np.concatenate((texcoords, normals.numpy()[source], light[source]), -1)
         self._corner = mi.Float(corner.ravel())

@@ -43,7 +43,8 @@ def render(
         aovs: names out of `AOVS`.
         spp: samples per pixel of colour and mask.
         light: "studio" (soft room and three lamps), "environment" (a sky), "side" (one hard lamp), "portrait" (one
-            large lamp and a backdrop, which fills the frame behind the head) or "flat" (the texture's own colour, unlit).
+            large lamp and a backdrop, which fills the frame behind the head) or "flat" (the texture's own colour,
+            unlit).
         integrator: "direct" (one bounce) or "path".
         background: sRGB colour behind the head.
         roughness: UV map [S,S] in [0,1]; None for an even one.

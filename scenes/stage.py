@@ -86,15 +86,25 @@ class Stage:
             self._set("glasses.vertex_positions", hidden if glasses is None else glasses.points)
         self.params.update()
 
-    def set_lights(self, values: Mapping[str, Any]) -> None:
-        """Set numbers, colours and pictures of the scene's lamps by their `mi.traverse` names; applied with `pose`."""
+    def set_lights(self, values: Mapping[str, np.ndarray]) -> None:
+        """Set the lamps by their `mi.traverse` names; takes effect with `pose`.
+
+        Args:
+            values: colours [3], transforms [4,4] or pictures [H,W,3] of the size that the scene holds, all linear.
+
+        Raises:
+            ValueError: the scene has no such parameter.
+        """
         for name, value in values.items():
             if name not in self.params:
                 raise ValueError(f"the scene '{self.light}' has no parameter '{name}'")
-            if isinstance(value, np.ndarray):
-                self._set(name, value)
+            if value.ndim == 3:
+                # The scene keeps a few columns more, which repeat the first ones.
+                missing = self.params[name].shape[1] - value.shape[1]
+                self._set(name, np.pad(value, ((0, 0), (0, missing), (0, 0)), mode="wrap"))
             else:
-                _assign(self.params, name, value)
+                kind = type(self.params[name])
+                _assign(self.params, name, kind(value.tolist()) if value.ndim == 1 else kind(value))
 
     def _aim(self, camera: Camera) -> None:
         mi = load_mitsuba()

@@ -114,7 +114,7 @@ def _hair_colour(random: np.random.Generator, melanin: float, age: float) -> tup
     reach = 5.0 if melanin < 0.3 else 2.2 if melanin < 0.6 else 0.7
     natural = np.array(_blend(_HAIR, random.uniform(0, reach)))
     grey = float(np.clip(random.normal((age - 0.6) * 2.2, 0.35), 0, 1)) if age > 0.4 else 0.0
-    if random.random() < 0.04:
+    if random.random() < 0.025:
         natural = random.uniform(0.02, 0.45, 3)  # dyed
     return tuple((natural * (1 - grey) + np.array(_GREY) * grey).tolist())
 

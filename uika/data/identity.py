@@ -1,0 +1,152 @@
+"""All images of one synthetic person."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+
+from uika.data.encode import encode_colour, encode_depth, encode_uv
+from uika.data.performance import perform, place_camera, viewpoints
+from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, shaped_vertices, vertex_normals
+
+_SPP = 4
+_LIGHT_SAMPLES = 64
+_ENCODERS = 2
+_WAITING = 12  # images that may wait for an encoder
+# One stream of random numbers for each purpose, so that none depends on how often another was asked.
+_STREAMS = {"person": 0, "motion": 1, "light": 2, "camera": 3, "backdrop": 4, "samples": 5}
+
+
+def generate_identity(
+    head: HeadModel, seed: int, identity: int, views: int, frames: int, size: int
+) -> Iterator[tuple[str, bytes]]:
+    """Files of the capture of one person as (path inside its folder, content), in a fixed order.
+
+    All depends on the arguments alone. The folder holds `transforms.json` and parameter files as VHAP exports them, and
+    beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`).
+    """
+    from scenes.deferred import Shader, as_texture
+    from scenes.lighting import backdrop, sample_lighting
+    from scenes.people import paint, sample_person, wear_glasses
+    from scenes.people.hair import hair_offsets
+    from scenes.render import linear_to_srgb
+    from scenes.stage import load_stage
+
+    person = sample_person(int(_random(seed, identity, "person").integers(2**31)), head)
+    lighting = sample_lighting(_random(seed, identity, "light"))
+    stage = load_stage(head, 16, 16, lighting.light, "direct")
+    stage.set_lights(lighting.values)
+    texture = as_texture(*paint(person, head, texture_size(size)))
+    offset = hair_offsets(person, head)
+    params = perform(head, person.shape, frames, _random(seed, identity, "motion"))
+    bare = shaped_vertices(head, HeadParameters.zeros(head).replace(identity=person.shape))
+    exposure = lighting.brightness / _face_radiance(stage, head, bare + offset)
+    cameras = [
+        place_camera(view, size, _random(seed, identity, "camera", index))
+        for index, view in enumerate(viewpoints(views))
+    ]
+    backdrops = [backdrop(_random(seed, identity, "backdrop", index), size) for index in range(views)]
+    yield "canonical_flame_param.npz", _npz(shape=person.shape[None], static_offset=offset[None])
+    posed = pose_vertices(head, params, offset)
+    with ThreadPoolExecutor(_ENCODERS) as pool:
+        waiting: deque[tuple[str, Future[bytes]]] = deque()
+        for frame in range(frames):
+            yield f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))
+            glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
+            samples = int(_random(seed, identity, "samples", frame).integers(2**31))
+            shader = Shader(
+                stage, head, posed[frame], texture, glasses, exposure=exposure, samples=_LIGHT_SAMPLES, seed=samples
+            )
+            for view, camera in enumerate(cameras):
+                seen = shader.view(camera, _SPP, ("uv", "depth", "triangle"))
+                alpha = seen["mask"][..., None]
+                image = linear_to_srgb(seen["rgb"]) * alpha + backdrops[view] * (1 - alpha)
+                name = f"{frame:05d}_{view:02d}.png"
+                waiting.append((f"images/{name}", pool.submit(encode_colour, image)))
+                waiting.append((f"fg_masks/{name}", pool.submit(encode_colour, seen["mask"])))
+                waiting.append((f"uv/{name}", pool.submit(encode_uv, seen["uv"], seen["triangle"] >= 0)))
+                waiting.append((f"depth/{name}", pool.submit(encode_depth, seen["depth"])))
+                while len(waiting) > _WAITING:
+                    path, result = waiting.popleft()
+                    yield path, result.result()
+        while waiting:
+            path, result = waiting.popleft()
+            yield path, result.result()
+    description = {
+        "head_id": head.id,
+        "person": {"cut": person.cut, "beard": person.beard, "glasses": person.glasses is not None},
+        "light": lighting.light,
+        "frames": [_entry(frame, view, camera) for frame in range(frames) for view, camera in enumerate(cameras)],
+    }
+    yield "transforms.json", json.dumps(description, indent=1).encode()
+
+
+def texture_size(size: int) -> int:
+    """Side of the atlas in texels that suits images of `size` pixels."""
+    return min(max(256, 2 * size), 1024)
+
+
+def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.Generator:
+    return np.random.default_rng([seed, identity, _STREAMS[stream], index])
+
+
+def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor) -> float:
+    """Mean radiance of a white, resting face."""
+    from scenes.deferred import gather_light
+
+    stage.pose(head, vertices)
+    face = (head.masks["face"] > 0.5).nonzero()[:, 0]
+    normals = vertex_normals(vertices, head.faces)
+    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES, 0)[:, :3]
+    return max(float(light.mean()), 1e-4)
+
+
+def _flame(params: HeadParameters) -> dict[str, torch.Tensor]:
+    return {
+        "shape": params.identity,
+        "expr": params.expression[None],
+        "rotation": params.rotation[None],
+        "neck_pose": params.neck[None],
+        "jaw_pose": params.jaw[None],
+        "eyes_pose": params.eyes[None],
+        "translation": params.translation[None],
+    }
+
+
+def _npz(**tensors: torch.Tensor) -> bytes:
+    buffer = io.BytesIO()
+    # numpy stamps every entry with 1980, so equal arrays give equal bytes.
+    arrays: dict[str, Any] = {name: tensor.contiguous().numpy() for name, tensor in tensors.items()}
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _entry(frame: int, view: int, camera: Camera) -> dict[str, Any]:
+    to_world = torch.linalg.inv(camera.viewmat.double())
+    to_world[:3, 1:3] *= -1  # OpenGL axes
+    name = f"{frame:05d}_{view:02d}.png"
+    K = camera.K.double()
+    return {
+        "timestep_index": frame,
+        "camera_index": view,
+        "camera_id": f"{view:02d}",
+        "fl_x": float(K[0, 0]),
+        "fl_y": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "w": camera.width,
+        "h": camera.height,
+        "transform_matrix": to_world.tolist(),
+        "file_path": f"images/{name}",
+        "fg_mask_path": f"fg_masks/{name}",
+        "flame_param_path": f"flame_param/{frame:05d}.npz",
+        "uv_path": f"uv/{name}",
+        "depth_path": f"depth/{name}",
+    }

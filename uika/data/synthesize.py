@@ -1,0 +1,191 @@
+"""Writing a set of synthetic people: resumable, in shards, the same whatever the number of machines."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from uika.data.identity import generate_identity
+from uika.data.shards import EXTENSIONS, write_shard
+from uika.errors import UikaError, install_command
+from uika.files import check_folder, replacing
+from uika.head import HeadModel, load_head
+
+SETTINGS_FILE = "synthesis.json"
+_LIMITS = {"identities": 1_000_000, "views": 64, "frames": 1000, "size": 2048}
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """What to make. Two runs with the same values write the same files, whichever shards they take."""
+
+    output: Path
+    identities: int = 1000
+    views: int = 9
+    frames: int = 13
+    size: int = 512
+    seed: int = 0
+    shard: str = "0/1"  # "i/n": this run makes the identities i, i + n, i + 2n, ...
+    archives: bool = True  # whether to write webdataset shards beside the folders
+
+    def part(self) -> tuple[int, int]:
+        """The i and n of `shard`.
+
+        Raises:
+            UikaError: it is not two numbers i/n with 0 <= i < n.
+        """
+        first, _, count = self.shard.partition("/")
+        if not (first.isdecimal() and count.isdecimal() and int(first) < int(count)):
+            raise UikaError(f"shard must be i/n with 0 <= i < n, such as 0/2, not '{self.shard}'")
+        return int(first), int(count)
+
+
+@dataclass(frozen=True)
+class SynthesisReport:
+    """What a run did."""
+
+    made: int  # people rendered by this run
+    kept: int  # people that were complete before
+    images: int  # images rendered by this run
+
+
+def synthesize(settings: Synthesis, head: HeadModel | None = None, progress: bool = True) -> SynthesisReport:
+    """Make the people of one shard that are not complete yet.
+
+    `output/captures/000012/` holds a person as a capture (`uika.data.open_capture` reads it) and
+    `output/shards/000012.tar` the same files as a webdataset shard. A person appears under its name only when complete,
+    so a run that was killed can be started again.
+
+    Raises:
+        UikaError: a value is out of range, the folder holds a set made with other values, or the disk is full.
+    """
+    part, parts = settings.part()
+    for name, most in _LIMITS.items():
+        if not 1 <= getattr(settings, name) <= most:
+            raise UikaError(f"{name} must lie between 1 and {most}, not {getattr(settings, name)}")
+    if settings.seed < 0 or settings.size < 16:
+        raise UikaError("seed must not be negative and size at least 16 pixels")
+    model = load_head() if head is None else head
+    root = check_folder(settings.output)
+    wanted = range(part, settings.identities, parts)
+    made = kept = 0
+    with _disk_errors(root), _bar(len(wanted) * settings.views * settings.frames, progress) as bar:
+        _agree(root, settings, model)
+        for identity in wanted:
+            if _complete(root, identity, settings):
+                kept += 1
+                bar.skip(settings.views * settings.frames)
+                continue
+            _make(root, identity, settings, model, bar)
+            made += 1
+    return SynthesisReport(made, kept, made * settings.views * settings.frames)
+
+
+def identity_name(identity: int) -> str:
+    """The name of a person's folder and shard."""
+    return f"{identity:06d}"
+
+
+def _make(root: Path, identity: int, settings: Synthesis, head: HeadModel, bar: _Bar) -> None:
+    name = identity_name(identity)
+    folder = root / "captures" / name
+    if not folder.exists():
+        partial = folder.with_name(f".{name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        files = generate_identity(head, settings.seed, identity, settings.views, settings.frames, settings.size)
+        for path, content in files:
+            target = partial / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+            bar.add(path.startswith("images/"))
+        partial.replace(folder)
+    if settings.archives:
+        write_shard(root / "shards" / f"{name}.tar", _entries(folder, name))
+
+
+def _complete(root: Path, identity: int, settings: Synthesis) -> bool:
+    name = identity_name(identity)
+    archived = not settings.archives or (root / "shards" / f"{name}.tar").exists()
+    return archived and (root / "captures" / name).exists()
+
+
+def _entries(folder: Path, name: str) -> Iterator[tuple[str, bytes]]:
+    """Entries of the shard of one person: what all samples share first, then the samples."""
+    description = json.loads((folder / "transforms.json").read_text())
+    frames = description.pop("frames")
+    yield f"{name}.canonical.npz", (folder / "canonical_flame_param.npz").read_bytes()
+    yield f"{name}.json", json.dumps(description).encode()
+    for frame in frames:
+        key = f"{name}_{frame['timestep_index']:05d}_{frame['camera_id']}"
+        for kind, extension in EXTENSIONS.items():
+            yield f"{key}.{extension}", (folder / frame[kind]).read_bytes()
+        yield f"{key}.json", json.dumps(frame).encode()
+
+
+def _agree(root: Path, settings: Synthesis, head: HeadModel) -> None:
+    """Write the settings of a new set, or make sure that they are those of the set in the folder."""
+    own = {name: getattr(settings, name) for name in ("views", "frames", "size", "seed")} | {"head_id": head.id}
+    file = root / SETTINGS_FILE
+    if not file.exists():
+        with replacing(file) as temporary:
+            temporary.write_text(json.dumps(own, indent=1) + "\n")
+        return
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise UikaError(f"{file}: cannot be read; remove it or choose another folder ({error})") from error
+    if found != own:
+        raise UikaError(f"{file}: the folder holds a set made with other values, {found}; choose another folder")
+
+
+class _disk_errors:  # noqa: N801 - used like a function
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, OSError):
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            reason = "the disk is full; free space" if full else f"writing failed ({error}); repair this"
+            raise UikaError(f"{self._root}: {reason} and run the same command again to go on") from error
+
+
+class _Bar:
+    """Images done, with the time that is left; silent when not wanted."""
+
+    def __init__(self, total: int, visible: bool) -> None:
+        self._bar: Any = None
+        if visible:
+            try:
+                from tqdm import tqdm
+            except ImportError as error:
+                raise UikaError(f"the progress bar needs tqdm; run: {install_command('tqdm')}") from error
+            self._bar = tqdm(total=total, unit="image", desc="synthesize", smoothing=0.05)
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def add(self, count: int) -> None:
+        if self._bar is not None:
+            self._bar.update(count)
+
+    def skip(self, count: int) -> None:
+        if self._bar is not None:
+            # What is already there must not count as speed.
+            self._bar.total -= count
+            self._bar.refresh()
+
+
+def _bar(total: int, visible: bool) -> _Bar:
+    return _Bar(total, visible)
