@@ -60,9 +60,9 @@ def test_backbone() -> None:
     torch.testing.assert_close(sin, data["out/rope_sin"], **TOLERANCE)
     torch.testing.assert_close(cos, data["out/rope_cos"], **TOLERANCE)
     with torch.no_grad():
-        maps = model(data["in/x"])
-    for features, name in zip(maps, ("layer0", "layer2"), strict=True):
-        torch.testing.assert_close(features.flatten(2).transpose(1, 2), data[f"out/{name}"], **TOLERANCE)
+        taps = model(data["in/x"])
+    for features, name in zip(taps, ("layer0", "layer2"), strict=True):
+        torch.testing.assert_close(features, data[f"out/{name}"], **TOLERANCE)
 
 
 def test_encoder_and_its_fusion_heads() -> None:
@@ -70,14 +70,16 @@ def test_encoder_and_its_fusion_heads() -> None:
     backbone = BackboneConfig(dim=32, depth=24, heads=2, taps=(4, 11, 17, 23))
     encoder = Encoder(dataclasses.replace(PRESETS["paper"], backbone=backbone, dim=40, heads=2))
     fit(encoder, weights)
-    maps = tuple(data[f"in/feats.{index}"].transpose(1, 2).unflatten(2, (3, 4)) for index in range(4))
-    image = data["in/image"][:, None]
+    taps = tuple(data[f"in/feats.{index}"] for index in range(4))
+    image = data["in/image"]
     assert encoder.uv_fusion_head is not None
     with torch.no_grad():
-        torch.testing.assert_close(encoder.fusion_head(maps), data["out/head_from_feats"], **TOLERANCE)
-        torch.testing.assert_close(encoder.uv_fusion_head(maps), data["out/uv_head_from_feats"], **TOLERANCE)
-        torch.testing.assert_close(encoder.screen(image), data["out/screen"], **TOLERANCE)
-        torch.testing.assert_close(encoder.uv(image), data["out/uv"], **TOLERANCE)
+        for head, name in ((encoder.fusion_head, "head"), (encoder.uv_fusion_head, "uv_head")):
+            fused = head(taps).transpose(1, 2).unflatten(2, (3, 4))
+            torch.testing.assert_close(fused, data[f"out/{name}_from_feats"], **TOLERANCE)
+        for tokens, name in ((encoder.screen(image), "screen"), (encoder.uv(image), "uv")):
+            assert tokens is not None
+            torch.testing.assert_close(torch.stack(tokens), data[f"out/{name}"], **TOLERANCE)
 
 
 def test_estimator_aggregator() -> None:
@@ -87,9 +89,8 @@ def test_estimator_aggregator() -> None:
     fit(aggregator, weights)
     with torch.no_grad():
         features = aggregator.features(data["in/images"])
-        outputs = aggregator.exchange(features)
-    tokens = features.flatten(0, 1).flatten(2).transpose(1, 2)
-    torch.testing.assert_close(tokens, data["out/patch_tokens"], **TOLERANCE)
+        outputs = aggregator.exchange(features, (3, 5))
+    torch.testing.assert_close(features.flatten(0, 1), data["out/patch_tokens"], **TOLERANCE)
     for index, output in enumerate(outputs):
         torch.testing.assert_close(output, data[f"out/out.{index}"], **TOLERANCE)
 

@@ -11,8 +11,11 @@ from uika.model.config import (
     UvConfig,
 )
 from uika.model.estimator import Estimator
+from uika.model.features import FeatureCache, ViewFeatures
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels, multiply_quaternions
-from uika.model.reconstructor import Observation, Reconstructor
+from uika.model.observation import Observation
+from uika.model.precision import compile_blocks, computes_bfloat16
+from uika.model.reconstructor import Reconstructor
 
 __all__ = [
     "ESTIMATORS",
@@ -22,13 +25,17 @@ __all__ = [
     "CheckpointError",
     "Estimator",
     "EstimatorConfig",
+    "FeatureCache",
     "GaussianConfig",
     "ModelConfig",
     "Observation",
     "Reconstructor",
     "SurfaceTexels",
     "UvConfig",
+    "ViewFeatures",
     "build",
+    "compile_blocks",
+    "computes_bfloat16",
     "load_checkpoint",
     "multiply_quaternions",
     "save_checkpoint",

@@ -166,19 +166,38 @@ class VisionTransformer(nn.Module):
             self.requires_grad_(False)
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Normalised images [N,3,H,W], sides multiples of the patch size -> one [N,C,H/p,W/p] map per tap.
+        """Normalised images [N,3,H,W], sides multiples of the patch size -> [N,h*w,C] patch tokens of each tap.
 
         Every tap passes the final LayerNorm; class and storage tokens are dropped.
         """
+        patches, rope = self._embed(images)
+        return self._run(patches, rope)
+
+    def kept(self, images: Tensor, keep: Tensor) -> list[tuple[Tensor, ...]]:
+        """Like `forward` for the patches of keep [N,h*w] alone, the others being absent: one [L,C] per tap and image.
+
+        Images keep different numbers of patches and therefore pass one by one; one without any passes not at all.
+        """
+        results = []
+        for image, mask in zip(images, keep, strict=True):
+            patches, (sin, cos) = self._embed(image[None])
+            if bool(mask.any()):
+                taps = self._run(patches[:, mask], (sin[mask], cos[mask]))
+            else:
+                taps = tuple(patches[:, mask] for _ in self.taps)
+            results.append(tuple(tap[0] for tap in taps))
+        return results
+
+    def _embed(self, images: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         patches = self.patch_embed(images)
-        rows, columns = patches.shape[-2:]
-        prefix = torch.cat([self.cls_token, self.storage_tokens], dim=1).expand(len(images), -1, -1)
-        tokens = torch.cat([prefix, patches.flatten(2).transpose(1, 2)], dim=1)
-        rope = self.rope_embed(rows, columns)
-        maps = []
+        return patches.flatten(2).transpose(1, 2), self.rope_embed(*patches.shape[-2:])
+
+    def _run(self, patches: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+        prefix = torch.cat([self.cls_token, self.storage_tokens], dim=1).expand(len(patches), -1, -1)
+        tokens = torch.cat([prefix, patches], dim=1)
+        taps = []
         for index, block in enumerate(self.blocks[: max(self.taps) + 1]):
             tokens = block(tokens, rope)
             if index in self.taps:
-                features = self.norm(tokens)[:, prefix.shape[1] :]
-                maps.append(features.transpose(1, 2).unflatten(2, (rows, columns)))
-        return tuple(maps)
+                taps.append(self.norm(tokens[:, prefix.shape[1] :]))
+        return tuple(taps)

@@ -40,7 +40,9 @@ class ViewAttention(nn.Module):
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
         """x [N,L,C], rope (sin, cos) [P,C/heads] repeated along the L = views * P tokens."""
         query, key, value = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
-        query, key = self._turn(self.q_norm(query), rope), self._turn(self.k_norm(key), rope)
+        exact = self.q_norm.weight.dtype
+        query, key = self.q_norm(query.to(exact)), self.k_norm(key.to(exact))
+        query, key = (self._turn(part, rope).to(value.dtype) for part in (query, key))
         out = functional.scaled_dot_product_attention(query, key, value)
         return self.proj(out.transpose(1, 2).flatten(2))
 
@@ -85,14 +87,15 @@ class Aggregator(nn.Module):
         self.global_blocks = nn.ModuleList(ViewBlock(dim, config.heads) for _ in range(config.layers))
 
     def features(self, images: Tensor) -> Tensor:
-        """Photos [B,V,3,H,W] in [0,1] -> [B,V,C,h,w], of each view alone: what a photo's cache can hold."""
+        """Photos [B,V,3,H,W] in [0,1] -> [B,V,h*w,C], each view by itself: what a photo's cache can hold."""
         return self.patch_embed(standardize(images.flatten(0, 1)))[-1].unflatten(0, images.shape[:2])
 
-    def exchange(self, features: Tensor) -> list[Tensor]:
-        """[B,V,C,h,w] -> one [B,V,h*w,2C] per pair of blocks: the frame block's tokens beside the global one's."""
-        batch, views, _, rows, columns = features.shape
+    def exchange(self, features: Tensor, grid: tuple[int, int]) -> list[Tensor]:
+        """[B,V,h*w,C] of grid (h, w) -> one [B,V,h*w,2C] per pair of blocks, the frame's tokens beside the global's."""
+        batch, views = features.shape[:2]
+        rows, columns = grid
         rope = grid_rotation(rows, columns, self.head_dim, features.device)
-        x = features.flatten(0, 1).flatten(2).transpose(1, 2)
+        x = features.flatten(0, 1)
         outputs = []
         for frame, whole in zip(self.frame_blocks, self.global_blocks, strict=True):
             local = frame(x, rope)
@@ -100,10 +103,6 @@ class Aggregator(nn.Module):
             x = x.unflatten(1, (views, rows * columns)).flatten(0, 1)
             outputs.append(torch.cat([local, x], dim=-1).unflatten(0, (batch, views)))
         return outputs
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        """Photos [B,V,3,H,W] in [0,1], sides multiples of the patch size; see `exchange`."""
-        return self.exchange(self.features(images))
 
 
 class Estimator(nn.Module):
@@ -124,9 +123,8 @@ class Estimator(nn.Module):
         patch = self.config.backbone.patch_size
         if images.ndim != 5 or images.shape[2] != 3 or images.shape[3] % patch or images.shape[4] % patch:
             raise ValueError(f"images must be [B,V,3,H,W] with sides multiples of {patch}, got {list(images.shape)}")
-        return self.locate(self.aggregator.features(images))
+        return self.locate(self.aggregator.features(images), (images.shape[3] // patch, images.shape[4] // patch))
 
-    def locate(self, features: Tensor) -> Tensor:
-        """The same from `Aggregator.features` [B,V,C,h,w] of all views."""
-        rows, columns = features.shape[-2:]
-        return self.uv_head(self.aggregator.exchange(features), (rows, columns))
+    def locate(self, features: Tensor, grid: tuple[int, int]) -> Tensor:
+        """The same from `Aggregator.features` [B,V,h*w,C] of all views."""
+        return self.uv_head(self.aggregator.exchange(features, grid), grid)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 _EPS = 1e-6
+# Rows that pass a query projection or a feed-forward at once: bounds the memory of many views, changes no value.
+_ROWS = 8192
 
 
 class JointAttention(nn.Module):
@@ -26,24 +30,34 @@ class JointAttention(nn.Module):
 
     def forward(self, tokens: Tensor, context: Tensor) -> tuple[Tensor, Tensor | None]:
         """tokens [B,L,C], context [B,M,C] -> their updates (the context's is None without `context_out`)."""
-        length = tokens.shape[1]
-        query = self.norm_q(self._split(self.to_q(tokens)))
-        if self.add_q_proj is not None and self.norm_added_q is not None:
-            query = torch.cat([query, self.norm_added_q(self._split(self.add_q_proj(context)))], dim=2)
         key = torch.cat(
-            [
-                self.norm_k(self._split(self.to_k(tokens))),
-                self.norm_added_k(self._split(self.add_k_proj(context))),
-            ],
+            [self._split(self.to_k(tokens), self.norm_k), self._split(self.add_k_proj(context), self.norm_added_k)],
             dim=2,
         )
         value = torch.cat([self._split(self.to_v(tokens)), self._split(self.add_v_proj(context))], dim=2)
-        out = functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
-        update = self.to_out(out[:, :length])
-        return update, None if self.to_add_out is None else self.to_add_out(out[:, length:])
 
-    def _split(self, x: Tensor) -> Tensor:
-        return x.unflatten(2, (self.heads, -1)).transpose(1, 2)
+        def update(project: nn.Module, norm: nn.Module, out: nn.Module, rows: Tensor) -> Tensor:
+            query = self._split(project(rows), norm).to(value.dtype)
+            answer = functional.scaled_dot_product_attention(query, key.to(value.dtype), value)
+            return out(answer.transpose(1, 2).flatten(2))
+
+        token_update = in_rows(lambda rows: update(self.to_q, self.norm_q, self.to_out, rows), tokens)
+        if self.add_q_proj is None or self.norm_added_q is None or self.to_add_out is None:
+            return token_update, None
+        parts = self.add_q_proj, self.norm_added_q, self.to_add_out
+        return token_update, in_rows(lambda rows: update(*parts, rows), context)
+
+    def _split(self, x: Tensor, norm: nn.Module | None = None) -> Tensor:
+        """[B,L,C] -> [B,heads,L,C/heads], normalised in the precision of the norm's weights."""
+        x = x.unflatten(2, (self.heads, -1)).transpose(1, 2)
+        return x if norm is None else norm(x.to(next(norm.parameters()).dtype))
+
+
+def in_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """`function` of x [B,L,C], which treats each row by itself; without gradients a bounded number of them at once."""
+    if torch.is_grad_enabled() or x.shape[1] <= _ROWS:
+        return function(x)
+    return torch.cat([function(rows) for rows in x.split(_ROWS, dim=1)], dim=1)
 
 
 class _GeluProjection(nn.Module):
@@ -64,8 +78,8 @@ class FeedForward(nn.Module):
         self.net = nn.Sequential(_GeluProjection(dim, 4 * dim), nn.Identity(), nn.Linear(4 * dim, dim))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[...,dim]."""
-        return self.net(x)
+        """[B,L,dim]."""
+        return in_rows(self.net, x)
 
 
 class MMBlock(nn.Module):

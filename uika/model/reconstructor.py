@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from uika.model.config import ModelConfig
 from uika.model.dpt import UvDpt, resize
+from uika.model.features import FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
 from uika.model.heads import AttributeHeads, Attributes, TexelMlp
+from uika.model.observation import Observation, join, observe
+from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import MMTransformer
-from uika.uv import aggregate, fill, reproject
-
-
-class Observation(NamedTuple):
-    """What the photos say about the atlas."""
-
-    color: Tensor  # [B,3,S,S] aggregate, completed where the config asks for it
-    confidence: Tensor  # [B,1,S,S]
-    views: Tensor  # [B,V,3,I,I] reprojected image of each view
-    report: dict[str, int]
+from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
 
 class GaussianDecoder(nn.Module):
@@ -39,7 +33,10 @@ class GaussianDecoder(nn.Module):
     def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
         """Tokens of four depths, observed [B,4,S,S], texel [M]."""
         features = resize(self.dpt_decoder(tokens, observed), (self.map_size, self.map_size))
-        return self.gs_net(self.mlp_net(_gather(features, texel)), _gather(observed, texel), surface)
+        # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
+        with torch.autocast(features.device.type, enabled=False):
+            picked = _gather(features, texel).to(observed.dtype)
+            return self.gs_net(self.mlp_net(picked), _gather(observed, texel), surface)
 
 
 class Reconstructor(nn.Module):
@@ -54,9 +51,15 @@ class Reconstructor(nn.Module):
         """Random initialisation from the global generator; see `uika.model.build` for a seeded one."""
         super().__init__()
         self.config = config
+        self.precision: Precision = "float32"
         self.encoder = Encoder(config)
         self.transformer = MMTransformer(config)
         self.gs_decoder = GaussianDecoder(config)
+
+    def halve(self) -> None:
+        """Store the weights in bfloat16 and compute in it where the device can; the per-texel MLP stays float32."""
+        halve(self, exempt=(self.gs_decoder.mlp_net, self.gs_decoder.gs_net))
+        self.precision = "bfloat16"
 
     def forward(
         self,
@@ -66,6 +69,8 @@ class Reconstructor(nn.Module):
         pixel_weight: Tensor | None,
         texel: Tensor,
         surface: SurfaceTexels,
+        keep: Keep = "all",
+        cache: FeatureCache | None = None,
     ) -> CanonicalGaussians:
         """Reconstruct a batch of heads, each from V views.
 
@@ -76,18 +81,82 @@ class Reconstructor(nn.Module):
                       (uv.grid "corners") counts every pixel once and takes no notice of it
         texel         [M] int64 row-major indices of the valid texels of the S*S atlas (S = config.map_size)
         surface       the canonical surface at those texels
+        keep          "all" patches and tokens, or the "foreground": patches with nothing of the mask, patches of
+                      reprojected images without a pixel and tokens outside the atlas are left out, an approximation
+        cache         features of photos seen before, so that only new ones are encoded; results are the same
 
         The report counts `views`, `empty_views` (no pixel reached the atlas), `texels`, `empty_texels` (valid texels
-        that no pixel reached, summed over the batch) and `completed_texels` (those given a colour by mirror or
-        diffusion). Raises ValueError for shapes that do not fit.
+        that no pixel reached, summed over the batch), `completed_texels` (those given a colour by mirror or
+        diffusion), `patches` of photos and reprojected images, `skipped_patches`, `tokens`, `skipped_tokens` and
+        `reused_views` (taken from the cache). Raises ValueError for shapes that do not fit.
         """
         self._check(images, texel, surface)
-        seen = self.observe(images, masks, pixel_uv, pixel_weight, texel, surface)
-        size = (self.config.image_size, self.config.image_size)
-        photos = resize(images.flatten(0, 1), size, antialias=True).unflatten(0, images.shape[:2])
-        tokens = self.transformer(self.encoder.screen(photos), self.encoder.uv(seen.views))
-        observed = torch.cat([seen.color, seen.confidence], dim=1)
-        result = self.gs_decoder(tokens, observed, texel, surface)
+        reused = 0 if cache is None else -cache.hits
+        items = self.encode(images, masks, pixel_uv, pixel_weight, keep, cache)
+        reused += 0 if cache is None else cache.hits
+        return self.decode(items, texel, surface, keep, reused)
+
+    def encode(
+        self,
+        images: Tensor,
+        masks: Tensor,
+        pixel_uv: Tensor,
+        pixel_weight: Tensor | None = None,
+        keep: Keep = "all",
+        cache: FeatureCache | None = None,
+    ) -> list[list[ViewFeatures]]:
+        """The features of every view of every item, each view by itself; arguments as in `forward`."""
+        weights = pixel_weight if self.config.uv.grid == "centers" else None
+        photos, mattes, coords = (value.flatten(0, 1)[:, None] for value in (images, masks, pixel_uv))
+        trust = None if weights is None else weights.flatten(0, 1)[:, None]
+
+        def screen(chosen: list[int]) -> list[Tensor]:
+            return self._screen(photos[chosen], mattes[chosen], keep)
+
+        def atlas(chosen: list[int]) -> list[tuple[Tensor | None, Sums]]:
+            rows = (photos[chosen], mattes[chosen], coords[chosen], None if trust is None else trust[chosen])
+            return self._atlas(*rows, keep)
+
+        if cache is None:
+            everything = list(range(images.shape[0] * images.shape[1]))
+            tokens, maps = screen(everything), atlas(everything)
+        else:
+            seen = (photos, None if keep == "all" else mattes)
+            tokens = cache.resolve("screen", content_keys(seen, keep), screen)
+            maps = cache.resolve("atlas", content_keys((photos, mattes, coords, trust), keep), atlas)
+        patch, (height, width) = self.config.backbone.patch_size, self.view_size(images)
+        patches = (height // patch) * (width // patch) + (height // patch) ** 2 * self.config.uv_attention
+        features = [ViewFeatures(photo, uv, sums, patches) for photo, (uv, sums) in zip(tokens, maps, strict=True)]
+        return [features[first : first + images.shape[1]] for first in range(0, len(features), images.shape[1])]
+
+    def decode(
+        self,
+        items: Sequence[Sequence[ViewFeatures]],
+        texel: Tensor,
+        surface: SurfaceTexels,
+        keep: Keep = "all",
+        reused: int = 0,
+    ) -> CanonicalGaussians:
+        """Gaussians of B heads from the features of their views, which may come from different calls of `encode`."""
+        seen = [observe(self.config.uv, join([view.sums for view in views]), texel, surface) for views in items]
+        color, confidence = torch.cat([each.color for each in seen]), torch.cat([each.confidence for each in seen])
+        grid = self.config.token_grid
+        kept = None if keep == "all" else covered_tokens(texel, self.config.map_size, grid)
+        with arithmetic(self.precision, texel.device):
+            tokens = self._attend(items, kept)
+            observed = torch.cat([color, confidence], dim=1)
+            result = self.gs_decoder(tokens, observed, texel, surface)
+        views = [view for item in items for view in item]
+        used = sum(len(view.screen) + (0 if view.uv is None else len(view.uv)) for view in views)
+        patches = sum(view.patches for view in views)
+        report = {
+            **{name: sum(each.report[name] for each in seen) for name in seen[0].report},
+            "patches": patches,
+            "skipped_patches": patches - used,
+            "tokens": len(items) * grid**2,
+            "skipped_tokens": 0 if kept is None else len(items) * int((~kept).sum()),
+            "reused_views": reused,
+        }
         return CanonicalGaussians(
             means=surface.points + result.offsets,
             quats=result.quats,
@@ -96,9 +165,9 @@ class Reconstructor(nn.Module):
             colors=result.colors,
             offsets=result.offsets,
             fusion_weight=result.fusion_weight,
-            aggregate=seen.color,
-            confidence=seen.confidence,
-            report=seen.report,
+            aggregate=color,
+            confidence=confidence,
+            report=report,
         )
 
     @torch.no_grad()
@@ -115,44 +184,48 @@ class Reconstructor(nn.Module):
         config = self.config.uv
         weights = pixel_weight if config.grid == "centers" else None
         size = self.config.map_size
-        valid = torch.zeros(size * size, dtype=torch.bool, device=images.device)
-        valid[texel] = True
-        valid = valid.reshape(size, size)
-        pooled = aggregate(
-            images,
-            pixel_uv,
-            masks,
-            size,
-            config.grid,
-            weights,
-            normalization=config.normalization,
-            oversample=config.oversample,
-            close_radius=config.close_radius,
-            valid=valid,
-        )
-        views, view_hits = reproject(
-            images,
-            pixel_uv,
-            masks,
-            self.config.image_size,
-            config.grid,
-            weights,
-            oversample=config.oversample,
-            close_radius=config.close_radius,
-        )
-        empty = int(((pooled.hits <= 0) & valid).sum())
-        color = pooled.rgb
-        if config.fill:
-            share = (pooled.trust / config.full_trust).clamp(0, 1)
-            color = fill(color, share, valid, surface.mirror, regions=surface.regions, prior=surface.prior)
-        report = {
-            "views": images.shape[0] * images.shape[1],
-            "empty_views": int((view_hits.amax(dim=(2, 3, 4)) <= 0).sum()),
-            "texels": images.shape[0] * len(texel),
-            "empty_texels": empty,
-            "completed_texels": empty if config.fill else 0,
-        }
-        return Observation(color, pooled.confidence, views, report)
+        sums = accumulate(images, pixel_uv, masks, size, config.grid, weights, oversample=config.oversample)
+        return observe(config, sums, texel, surface)
+
+    def view_size(self, images: Tensor) -> tuple[int, int]:
+        """Height and width at which the backbone sees photos [...,H,W]; reprojected images have the height's square."""
+        return self.config.image_size, self.config.image_size
+
+    def _screen(self, images: Tensor, masks: Tensor, keep: Keep) -> list[Tensor]:
+        """Tokens of photos [N,1,3,H,W]."""
+        size = self.view_size(images)
+        patch = self.config.backbone.patch_size
+        kept = None if keep == "all" else occupied(masks[:, 0], (size[0] // patch, size[1] // patch))
+        with arithmetic(self.precision, images.device):
+            return self.encoder.screen(resize(images[:, 0], size, antialias=True), kept)
+
+    def _atlas(
+        self, images: Tensor, masks: Tensor, uv: Tensor, weights: Tensor | None, keep: Keep
+    ) -> list[tuple[Tensor | None, Sums]]:
+        """Tokens of the reprojected images of photos [N,1,3,H,W], and what each photo adds to the aggregate."""
+        config, side = self.config.uv, self.view_size(images)[0]
+        sizes = (self.config.map_size, side)
+        sums, finer = accumulate_sizes(images, uv, masks, sizes, config.grid, weights, oversample=config.oversample)
+        views, hits = view_images(finer, config.close_radius)
+        grid = side // self.config.backbone.patch_size
+        kept = None if keep == "all" else occupied(hits[:, 0], (grid, grid))
+        with arithmetic(self.precision, images.device):
+            tokens = self.encoder.uv(views[:, 0], kept)
+        rows = [None] * len(images) if tokens is None else tokens
+        return [(row, Sums(*(part[index, 0] for part in sums))) for index, row in enumerate(rows)]
+
+    def _attend(self, items: Sequence[Sequence[ViewFeatures]], kept: Tensor | None) -> list[Tensor]:
+        """Tokens of the four depths; items of equal length pass together, others one by one without any padding."""
+        screen = [torch.cat([view.screen for view in views]) for views in items]
+        uv = [
+            torch.cat([view.uv for view in views if view.uv is not None]) for views in items if views[0].uv is not None
+        ]
+        if len({(len(first), len(second)) for first, second in zip(screen, uv or screen, strict=True)}) == 1:
+            return self.transformer(torch.stack(screen), torch.stack(uv) if uv else None, kept)
+        each = [
+            self.transformer(first[None], uv[index][None] if uv else None, kept) for index, first in enumerate(screen)
+        ]
+        return [torch.cat(depth) for depth in zip(*each, strict=True)]
 
     def _check(self, images: Tensor, texel: Tensor, surface: SurfaceTexels) -> None:
         if images.ndim != 5 or images.shape[2] != 3 or images.shape[1] < 1:

@@ -42,15 +42,25 @@ class MMTransformer(nn.Module):
         )
         self.norm_list = nn.ModuleList(nn.LayerNorm(config.dim, eps=_NORM_EPS) for _ in config.outputs)
 
-    def forward(self, screen: Tensor, uv: Tensor | None) -> list[Tensor]:
-        """Screen and UV features [B,V*L,D] -> the tokens [B,token_grid^2,D] at each output depth, normalised."""
-        tokens = (self.uv_token + self.uv_pos_embed).expand(screen.shape[0], -1, -1)
+    def forward(self, screen: Tensor, uv: Tensor | None, keep: Tensor | None = None) -> list[Tensor]:
+        """Screen and UV features [B,L,D], [B,M,D] -> the tokens [B,token_grid^2,D] at each output depth, normalised.
+
+        keep [token_grid^2] bool leaves out the other tokens; in the result they have their initial values.
+        """
+        start = self.uv_token + self.uv_pos_embed
+        tokens = (start if keep is None else start[keep]).expand(screen.shape[0], -1, -1)
         cond = self.linear_cond_proj(screen)
         cond2 = None if self.linear_cond_proj2 is None or uv is None else self.linear_cond_proj2(uv)
         results = []
         for depth, layer in enumerate(self.layers, start=1):
             tokens, cond, cond2 = layer(tokens, cond, cond2)
-            results += [
-                norm(tokens) for norm, output in zip(self.norm_list, self.outputs, strict=True) if output == depth
-            ]
+            for norm, output in zip(self.norm_list, self.outputs, strict=True):
+                if output == depth:
+                    results.append(norm(tokens if keep is None else _spread(tokens, keep, start)))
         return results
+
+
+def _spread(tokens: Tensor, keep: Tensor, start: Tensor) -> Tensor:
+    """Tokens [B,L,D] back at their places among all of `start` [T,D]."""
+    whole = start.to(tokens.dtype).expand(len(tokens), -1, -1)
+    return whole.index_copy(1, keep.nonzero()[:, 0], tokens)
