@@ -18,7 +18,7 @@ from uika.model.reconstructor import Reconstructor
 
 FORMAT = "uika-model"
 VERSION = "1"
-_LISTED = 8
+_LISTED = 20
 
 
 class CheckpointError(ValueError):
@@ -87,9 +87,9 @@ def load_checkpoint(path: str | Path) -> Reconstructor:
         model = Reconstructor(config)
     expected = model.state_dict()
     problems = [
-        _listing("missing", [name for name in expected if name not in tensors]),
-        _listing("unexpected", [name for name in tensors if name not in expected]),
-        _listing(
+        listing("missing", [name for name in expected if name not in tensors]),
+        listing("unexpected", [name for name in tensors if name not in expected]),
+        listing(
             "wrong shape",
             [
                 f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
@@ -124,7 +124,8 @@ def _read(path: Path) -> tuple[ModelConfig, dict[str, Tensor]]:
         raise CheckpointError(f"{path}: unreadable config in the header ({error})") from error
 
 
-def _listing(kind: str, names: list[str]) -> str:
+def listing(kind: str, names: list[str]) -> str:
+    """One phrase that names the first of many; empty for none."""
     if not names:
         return ""
     rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""

@@ -84,7 +84,8 @@ class EstimatorConfig:
 class ModelConfig:
     """Architecture of a `Reconstructor`.
 
-    image_size        side of the photos and reprojected views that the backbone sees (pixels)
+    image_size        side of the photos and reprojected views that the backbone sees (pixels); 0 takes photos as they
+                      are, and reprojected views as large as their height
     map_size          side of the aggregate and of the Gaussian attribute maps (texels)
     token_grid        side of the grid of learnable UV tokens
     dim, heads        width and attention heads of the transformer

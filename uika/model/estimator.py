@@ -120,11 +120,16 @@ class Estimator(nn.Module):
 
         Every pixel gets a value; those of the background mean nothing. Raises ValueError for shapes that do not fit.
         """
+        return self.locate(self.features(images), (images.shape[-2], images.shape[-1]))
+
+    def features(self, images: Tensor) -> Tensor:
+        """What each photo of [B,V,3,H,W] says by itself, [B,V,h*w,C]; see `Aggregator.features`."""
         patch = self.config.backbone.patch_size
         if images.ndim != 5 or images.shape[2] != 3 or images.shape[3] % patch or images.shape[4] % patch:
             raise ValueError(f"images must be [B,V,3,H,W] with sides multiples of {patch}, got {list(images.shape)}")
-        return self.locate(self.aggregator.features(images), (images.shape[3] // patch, images.shape[4] // patch))
+        return self.aggregator.features(images)
 
-    def locate(self, features: Tensor, grid: tuple[int, int]) -> Tensor:
-        """The same from `Aggregator.features` [B,V,h*w,C] of all views."""
+    def locate(self, features: Tensor, size: tuple[int, int]) -> Tensor:
+        """UV maps [B,V,2,*size] from the `features` of all views of pictures of `size` (H, W)."""
+        grid = (size[0] // self.config.backbone.patch_size, size[1] // self.config.backbone.patch_size)
         return self.uv_head(self.aggregator.exchange(features, grid), grid)

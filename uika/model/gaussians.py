@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +34,8 @@ class SurfaceTexels:
 class CanonicalGaussians:
     """One Gaussian per valid texel, in the order of `texel`, in the canonical space of the surface.
 
+    Unpacks as means, quats, scales, opacities, colors.
+
     means [B,M,3] metres, quats [B,M,4] wxyz unit, scales [B,M,3] metres, opacities [B,M], colors [B,M,3] in [0,1],
     offsets [B,M,3] metres (means minus surface points), fusion_weight [B,M] share of the predicted colour,
     aggregate [B,3,S,S] and confidence [B,1,S,S] the UV observation the colours start from,
@@ -50,6 +52,19 @@ class CanonicalGaussians:
     aggregate: Tensor
     confidence: Tensor
     report: Mapping[str, int]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """The five tensors that make the Gaussians."""
+        return iter((self.means, self.quats, self.scales, self.opacities, self.colors))
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A field by its name."""
+        if name not in _FIELDS:
+            raise KeyError(name)
+        return getattr(self, name)
+
+
+_FIELDS = tuple(name for name in CanonicalGaussians.__annotations__ if name != "report")
 
 
 def multiply_quaternions(first: Tensor, second: Tensor) -> Tensor:

@@ -188,8 +188,9 @@ class Reconstructor(nn.Module):
         return observe(config, sums, texel, surface)
 
     def view_size(self, images: Tensor) -> tuple[int, int]:
-        """Height and width at which the backbone sees photos [...,H,W]; reprojected images have the height's square."""
-        return self.config.image_size, self.config.image_size
+        """Height and width at which the backbone sees photos [...,H,W]; reprojected ones are squares of the height."""
+        side = self.config.image_size
+        return (side, side) if side else (images.shape[-2], images.shape[-1])
 
     def _screen(self, images: Tensor, masks: Tensor, keep: Keep) -> list[Tensor]:
         """Tokens of photos [N,1,3,H,W]."""
@@ -230,6 +231,9 @@ class Reconstructor(nn.Module):
     def _check(self, images: Tensor, texel: Tensor, surface: SurfaceTexels) -> None:
         if images.ndim != 5 or images.shape[2] != 3 or images.shape[1] < 1:
             raise ValueError(f"images must be [B,V,3,H,W] with at least one view, got {list(images.shape)}")
+        patch = self.config.backbone.patch_size
+        if not self.config.image_size and (images.shape[3] % patch or images.shape[4] % patch):
+            raise ValueError(f"images must have sides that are multiples of {patch}, got {list(images.shape)}")
         if not bool(torch.isfinite(images).all()):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
