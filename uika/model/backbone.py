@@ -72,21 +72,28 @@ class Attention(nn.Module):
         self.qkv = MaskedBiasLinear(dim)
         self.proj = nn.Linear(dim, dim)
 
-    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-        """x [N,L,C] with rope (sin, cos) of its last patches."""
-        count, length, dim = x.shape
-        query, key, value = self.qkv(x).reshape(count, length, 3, self.heads, dim // self.heads).unbind(2)
-        query, key = (_rotate(part.transpose(1, 2), rope) for part in (query, key))
-        out = functional.scaled_dot_product_attention(query, key, value.transpose(1, 2))
-        return self.proj(out.transpose(1, 2).reshape(count, length, dim))
+    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor], lengths: list[int] | None = None) -> Tensor:
+        """x [N,L,C] with rope (sin, cos) of its last patches, or of all L tokens.
+
+        With `lengths`, x [1,L,C] is a pack of images that many tokens long, which do not see each other.
+        """
+        query, key, value = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        query, key = _rotate(query, rope), _rotate(key, rope)
+        if lengths is None:
+            out = functional.scaled_dot_product_attention(query, key, value)
+        else:
+            images = zip(*(part.split(lengths, dim=2) for part in (query, key, value)), strict=True)
+            out = torch.cat([functional.scaled_dot_product_attention(*image) for image in images], dim=2)
+        return self.proj(out.transpose(1, 2).flatten(2))
 
 
 def _rotate(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-    sin, cos = rope
-    prefix, patches = x[:, :, : -sin.shape[0]], x[:, :, -sin.shape[0] :]
+    sin, cos = (part.to(x.dtype) for part in rope)
+    start = x.shape[2] - len(sin)
+    prefix, patches = x[:, :, :start], x[:, :, start:]
     first, second = patches.chunk(2, dim=-1)
-    turned = patches * cos.to(x.dtype) + torch.cat([-second, first], dim=-1) * sin.to(x.dtype)
-    return torch.cat([prefix, turned], dim=2)
+    turned = patches * cos + torch.cat([-second, first], dim=-1) * sin
+    return torch.cat([prefix, turned], dim=2) if start else turned
 
 
 class LayerScale(nn.Module):
@@ -129,9 +136,9 @@ class Block(nn.Module):
         self.mlp = Mlp(dim)
         self.ls2 = LayerScale(dim, layer_scale)
 
-    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
-        """x [N,L,C]."""
-        x = x + self.ls1(self.attn(self.norm1(x), rope))
+    def forward(self, x: Tensor, rope: tuple[Tensor, Tensor], lengths: list[int] | None = None) -> Tensor:
+        """See `Attention.forward`."""
+        x = x + self.ls1(self.attn(self.norm1(x), rope, lengths))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
@@ -171,33 +178,39 @@ class VisionTransformer(nn.Module):
         Every tap passes the final LayerNorm; class and storage tokens are dropped.
         """
         patches, rope = self._embed(images)
-        return self._run(patches, rope)
+        prefix = self._prefix().expand(len(patches), -1, -1)
+        start = prefix.shape[1]
+        return tuple(tap[:, start:] for tap in self._run(torch.cat([prefix, patches], dim=1), rope))
 
     def kept(self, images: Tensor, keep: Tensor) -> list[tuple[Tensor, ...]]:
         """Like `forward` for the patches of keep [N,h*w] alone, the others being absent: one [L,C] per tap and image.
 
-        Images keep different numbers of patches and therefore pass one by one; one without any passes not at all.
+        Images of any number of patches pass together, one after the other in a row without padding.
         """
-        results = []
-        for image, mask in zip(images, keep, strict=True):
-            patches, (sin, cos) = self._embed(image[None])
-            if bool(mask.any()):
-                taps = self._run(patches[:, mask], (sin[mask], cos[mask]))
-            else:
-                taps = tuple(patches[:, mask] for _ in self.taps)
-            results.append(tuple(tap[0] for tap in taps))
-        return results
+        patches, rope = self._embed(images)
+        prefix = self._prefix()[0]
+        start = len(prefix)
+        unturned = (torch.zeros_like(rope[0][:start]), torch.ones_like(rope[1][:start]))
+        lengths = [start + count for count in keep.sum(dim=1).tolist()]
+        row = torch.cat([part for index, mask in enumerate(keep) for part in (prefix, patches[index, mask])])
+        turns = tuple(
+            torch.cat([part for mask in keep for part in (still, turn[mask])])
+            for still, turn in zip(unturned, rope, strict=True)
+        )
+        taps = [tap[0].split(lengths) for tap in self._run(row[None], (turns[0], turns[1]), lengths)]
+        return [tuple(tap[start:] for tap in image) for image in zip(*taps, strict=True)]
 
     def _embed(self, images: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         patches = self.patch_embed(images)
         return patches.flatten(2).transpose(1, 2), self.rope_embed(*patches.shape[-2:])
 
-    def _run(self, patches: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        prefix = torch.cat([self.cls_token, self.storage_tokens], dim=1).expand(len(patches), -1, -1)
-        tokens = torch.cat([prefix, patches], dim=1)
+    def _prefix(self) -> Tensor:
+        return torch.cat([self.cls_token, self.storage_tokens], dim=1)
+
+    def _run(self, tokens: Tensor, rope: tuple[Tensor, Tensor], lengths: list[int] | None = None) -> tuple[Tensor, ...]:
         taps = []
         for index, block in enumerate(self.blocks[: max(self.taps) + 1]):
-            tokens = block(tokens, rope)
+            tokens = block(tokens, rope, lengths)
             if index in self.taps:
-                taps.append(self.norm(tokens[:, prefix.shape[1] :]))
+                taps.append(self.norm(tokens))
         return tuple(taps)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -34,10 +36,13 @@ def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, rad
 
 def _blur(maps: Tensor, radius: int) -> Tensor:
     """Separable Gaussian of sigma radius/2 cut at `radius`, zeros outside the map."""
-    offsets = torch.arange(-radius, radius + 1, dtype=maps.dtype, device=maps.device)
-    kernel = torch.exp(-2 * (offsets / radius) ** 2)
-    kernel = kernel / kernel.sum()
-    flat = maps.flatten(0, 1)[:, None]
-    flat = functional.conv2d(flat, kernel[None, None, :, None], padding=(radius, 0))
-    flat = functional.conv2d(flat, kernel[None, None, None, :], padding=(0, radius))
-    return flat[:, 0].reshape(maps.shape)
+    weights = [math.exp(-2 * (offset / radius) ** 2) for offset in range(-radius, radius + 1)]
+    total = sum(weights)
+    # A few shifted sums are many times faster than a convolution of single channels.
+    for axis, padding in ((-2, (0, 0, radius, radius)), (-1, (radius, radius))):
+        size = maps.shape[axis]
+        padded = functional.pad(maps, padding)
+        maps = padded.narrow(axis, 0, size) * (weights[0] / total)
+        for shift, weight in enumerate(weights[1:], start=1):
+            maps.add_(padded.narrow(axis, shift, size), alpha=weight / total)
+    return maps
