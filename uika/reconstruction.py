@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,18 +14,17 @@ from torch import Tensor
 
 from uika._version import __version__
 from uika.avatar import Avatar
-from uika.complete import MOUTH, regions, suppose
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 
 if TYPE_CHECKING:
     from uika.correspondence import Fit
-    from uika.model import Reconstructor, SurfaceTexels
+    from uika.feeding import ModelInputs
+    from uika.model import Reconstructor
     from uika.photo import Photo
 
 MAX_PHOTOS = 64
 _UNTRAINED_OPACITY = 0.95
-_MID_FACE = 0.55  # sRGB level of skin in even light, for judging how bright the photos are
 
 
 @dataclass(frozen=True)
@@ -79,9 +78,8 @@ def reconstruct(
     if not 1 <= len(photos) <= MAX_PHOTOS:
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
     from uika.correspondence import fit_photos, pixel_uv
+    from uika.feeding import model_inputs
     from uika.photo import head_matte, prepare
-    from uika.surface import surface_texels
-    from uika.uv import aggregate
 
     report = Report() if report is None else report
     with report.stage("model"):
@@ -99,14 +97,7 @@ def reconstruct(
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
     with report.stage("reconstruction"), torch.no_grad():
         identity = fit.parameters.identity[0]
-        surface, binding = surface_texels(head, identity, fit.static_offset, network.config.map_size)
-        views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
-        weights = weights * _plausible(regions(head, binding), uvs)
-        config = network.config.uv
-        pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=config.oversample)
-        known = (pooled.trust[0, 0] / config.full_trust).clamp(0, 1)
-        prior = suppose(head, binding, fit.static_offset, pooled.rgb[0], known, _brightness(images, weight))
-        inputs = (views, masks, uvs, weights, binding.texel, replace(surface, prior=prior))
+        inputs, binding = model_inputs(network.config, head, identity, fit.static_offset, images, mattes, uv, weight)
         means, quats, scales, opacities, colors, counts = _gaussians(network, inputs, run=model != "none")
     report.counts.update(counts)
     avatar = Avatar(
@@ -150,7 +141,7 @@ def _network(model: str | Path) -> tuple[Reconstructor, str]:
 
 
 def _gaussians(
-    network: Reconstructor, inputs: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, SurfaceTexels], run: bool
+    network: Reconstructor, inputs: ModelInputs, run: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
     """Means, quats, scales, opacities, colours (batch first) and counts, from the network or from the surface alone."""
     if run:
@@ -158,23 +149,7 @@ def _gaussians(
         counts = dict(result.report)
         return result.means, result.quats, result.scales, result.opacities, result.colors, counts
     seen = network.observe(*inputs)
-    texel, surface = inputs[-2:]
-    opacities = torch.full((1, len(texel)), _UNTRAINED_OPACITY)
-    colors = seen.color.flatten(2)[:, :, texel].mT.contiguous()
+    surface = inputs.surface
+    opacities = torch.full((1, len(inputs.texel)), _UNTRAINED_OPACITY)
+    colors = seen.color.flatten(2)[:, :, inputs.texel].mT.contiguous()
     return surface.points, surface.quats, surface.scales, opacities, colors, dict(seen.report)
-
-
-def _plausible(labels: Tensor, uv: Tensor) -> Tensor:
-    """0 for pixels [1,V,1,H,W] that seem to show the inside of the mouth, else 1.
-
-    A fit that is a millimetre off puts teeth on the tongue, where they stay when the mouth opens.
-    """
-    size = len(labels)
-    column, row = (torch.nan_to_num(uv) * size).long().clamp(0, size - 1).unbind(2)
-    return (labels[row, column] != MOUTH).to(uv.dtype)[:, :, None]
-
-
-def _brightness(images: Tensor, weight: Tensor) -> float:
-    """How bright the photos show the head: median level of its well-seen pixels over that of skin in even light."""
-    levels = images.mean(1)[weight > 0.5]
-    return 1.0 if len(levels) == 0 else float((levels.median() / _MID_FACE).clamp(0.3, 1.15))
