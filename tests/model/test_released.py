@@ -181,7 +181,7 @@ def test_file_without_head_tables_takes_given_texels(
     tensors: dict[str, Tensor], tmp_path: Path, model: released.ReleasedModel, photos: Photos
 ) -> None:
     bare = write(tmp_path, {key: value for key, value in tensors.items() if not key.startswith("renderer.")})
-    with pytest.raises(CheckpointError, match="valid_mask_flatten, renderer.flame_model.v_template_pix; give `texels`"):
+    with pytest.raises(CheckpointError, match=r"valid_mask_flatten, .*v_template_pix; give `texels`"):
         released.load(bare)
     again = released.load(bare, texels=(model.texel, model.points))
     assert torch.equal(again(*photos).means, model(*photos).means)
@@ -204,7 +204,7 @@ def test_estimator_file(
     estimator = released.load_estimator(path)
     assert torch.equal(estimator(photos[0]), model.estimate(photos[0]))
     without = write(tmp_path, {key: value for key, value in tensors.items() if not key.startswith(prefix)})
-    with pytest.raises(CheckpointError, match="uv_wrapper.model"):
+    with pytest.raises(CheckpointError, match=r"uv_wrapper\.model"):
         released.load(without)
     both = released.load(without, estimator=path)
     assert torch.equal(both(*photos[:2]).means, model(*photos[:2]).means)

@@ -16,6 +16,7 @@ from uika.model.gaussians import CanonicalGaussians, SurfaceTexels, multiply_qua
 from uika.model.observation import Observation
 from uika.model.precision import compile_blocks, computes_bfloat16
 from uika.model.reconstructor import Reconstructor
+from uika.model.session import Session
 
 __all__ = [
     "ESTIMATORS",
@@ -30,6 +31,7 @@ __all__ = [
     "ModelConfig",
     "Observation",
     "Reconstructor",
+    "Session",
     "SurfaceTexels",
     "UvConfig",
     "ViewFeatures",

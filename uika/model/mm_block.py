@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+Contexts = tuple[Tensor, Tensor | None]  # of the screen [B,M,C] and of UV [B,N,C]
+
 _EPS = 1e-6
 # Rows that pass a query projection or a feed-forward at once: bounds the memory of many views, changes no value.
 _ROWS = 8192
@@ -28,13 +30,17 @@ class JointAttention(nn.Module):
         self.norm_added_q = nn.RMSNorm(dim // heads, eps=_EPS) if context_out else None
         self.to_add_out = nn.Linear(dim, dim) if context_out else None
 
-    def forward(self, tokens: Tensor, context: Tensor) -> tuple[Tensor, Tensor | None]:
-        """tokens [B,L,C], context [B,M,C] -> their updates (the context's is None without `context_out`)."""
+    def forward(self, tokens: Tensor, context: Tensor, earlier: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """tokens [B,L,C], context [B,M,C] -> their updates (the context's is None without `context_out`).
+
+        `earlier` [B,E,C] is more context that is read and not updated.
+        """
+        read = context if earlier is None else torch.cat([earlier, context], dim=1)
         key = torch.cat(
-            [self._split(self.to_k(tokens), self.norm_k), self._split(self.add_k_proj(context), self.norm_added_k)],
+            [self._split(self.to_k(tokens), self.norm_k), self._split(self.add_k_proj(read), self.norm_added_k)],
             dim=2,
         )
-        value = torch.cat([self._split(self.to_v(tokens)), self._split(self.add_v_proj(context))], dim=2)
+        value = torch.cat([self._split(self.to_v(tokens)), self._split(self.add_v_proj(read))], dim=2)
 
         def update(project: nn.Module, norm: nn.Module, out: nn.Module, rows: Tensor) -> Tensor:
             query = self._split(project(rows), norm).to(value.dtype)
@@ -97,16 +103,19 @@ class MMBlock(nn.Module):
         self.attn2 = JointAttention(dim, heads, context_out=not last) if dual else None
         self.ff_context2 = FeedForward(dim) if dual and not last else None
 
-    def forward(self, x: Tensor, cond: Tensor, cond2: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    def forward(
+        self, x: Tensor, cond: Tensor, cond2: Tensor | None, earlier: Contexts | None = None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Tokens x [B,L,C], screen context [B,M,C], UV context [B,N,C] or None -> the three, updated.
 
-        In the last block the contexts come back unchanged.
+        In the last block the contexts come back unchanged. `earlier` contexts are read and not updated.
         """
+        old, old2 = earlier or (None, None)
         normed = self.norm1(x)
-        update, cond_update = self.attn(normed, self.norm1_context(cond))
+        update, cond_update = self.attn(normed, self.norm1_context(cond), _each(self.norm1_context, old))
         cond2_update = None
         if self.attn2 is not None and self.norm1_context2 is not None and cond2 is not None:
-            update2, cond2_update = self.attn2(normed, self.norm1_context2(cond2))
+            update2, cond2_update = self.attn2(normed, self.norm1_context2(cond2), _each(self.norm1_context2, old2))
             update = update + update2
         x = _feed(x + update, self.ff)
         if self.ff_context is not None and cond_update is not None:
@@ -114,6 +123,10 @@ class MMBlock(nn.Module):
         if self.ff_context2 is not None and cond2 is not None and cond2_update is not None:
             cond2 = _feed(cond2 + cond2_update, self.ff_context2)
         return x, cond, cond2
+
+
+def _each(norm: nn.Module, x: Tensor | None) -> Tensor | None:
+    return None if x is None else norm(x)
 
 
 def _feed(x: Tensor, feed_forward: FeedForward) -> Tensor:

@@ -15,7 +15,7 @@ from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
 from uika.model.heads import AttributeHeads, Attributes, TexelMlp
 from uika.model.observation import Observation, join, observe
 from uika.model.precision import Precision, arithmetic, halve
-from uika.model.transformer import MMTransformer
+from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
 
@@ -90,7 +90,7 @@ class Reconstructor(nn.Module):
         diffusion), `patches` of photos and reprojected images, `skipped_patches`, `tokens`, `skipped_tokens` and
         `reused_views` (taken from the cache). Raises ValueError for shapes that do not fit.
         """
-        self._check(images, texel, surface)
+        self.check(images, texel, surface)
         reused = 0 if cache is None else -cache.hits
         items = self.encode(images, masks, pixel_uv, pixel_weight, keep, cache)
         reused += 0 if cache is None else cache.hits
@@ -136,14 +136,19 @@ class Reconstructor(nn.Module):
         surface: SurfaceTexels,
         keep: Keep = "all",
         reused: int = 0,
+        memory: ContextMemory | None = None,
+        newcomers: int | None = None,
     ) -> CanonicalGaussians:
-        """Gaussians of B heads from the features of their views, which may come from different calls of `encode`."""
+        """Gaussians of B heads from the features of their views, which may come from different calls of `encode`.
+
+        With `memory` only the last `newcomers` views pass the transformer; those before are read from the memory.
+        """
         seen = [observe(self.config.uv, join([view.sums for view in views]), texel, surface) for views in items]
         color, confidence = torch.cat([each.color for each in seen]), torch.cat([each.confidence for each in seen])
         grid = self.config.token_grid
         kept = None if keep == "all" else covered_tokens(texel, self.config.map_size, grid)
         with arithmetic(self.precision, texel.device):
-            tokens = self._attend(items, kept)
+            tokens = self._attend([views[-(newcomers or 0) :] for views in items], kept, memory)
             observed = torch.cat([color, confidence], dim=1)
             result = self.gs_decoder(tokens, observed, texel, surface)
         views = [view for item in items for view in item]
@@ -215,20 +220,23 @@ class Reconstructor(nn.Module):
         rows = [None] * len(images) if tokens is None else tokens
         return [(row, Sums(*(part[index, 0] for part in sums))) for index, row in enumerate(rows)]
 
-    def _attend(self, items: Sequence[Sequence[ViewFeatures]], kept: Tensor | None) -> list[Tensor]:
+    def _attend(
+        self, items: Sequence[Sequence[ViewFeatures]], kept: Tensor | None, memory: ContextMemory | None
+    ) -> list[Tensor]:
         """Tokens of the four depths; items of equal length pass together, others one by one without any padding."""
         screen = [torch.cat([view.screen for view in views]) for views in items]
         uv = [
             torch.cat([view.uv for view in views if view.uv is not None]) for views in items if views[0].uv is not None
         ]
         if len({(len(first), len(second)) for first, second in zip(screen, uv or screen, strict=True)}) == 1:
-            return self.transformer(torch.stack(screen), torch.stack(uv) if uv else None, kept)
+            return self.transformer(torch.stack(screen), torch.stack(uv) if uv else None, kept, memory)
         each = [
             self.transformer(first[None], uv[index][None] if uv else None, kept) for index, first in enumerate(screen)
         ]
         return [torch.cat(depth) for depth in zip(*each, strict=True)]
 
-    def _check(self, images: Tensor, texel: Tensor, surface: SurfaceTexels) -> None:
+    def check(self, images: Tensor, texel: Tensor, surface: SurfaceTexels) -> None:
+        """Raise ValueError for arguments of `forward` that do not fit."""
         if images.ndim != 5 or images.shape[2] != 3 or images.shape[1] < 1:
             raise ValueError(f"images must be [B,V,3,H,W] with at least one view, got {list(images.shape)}")
         patch = self.config.backbone.patch_size

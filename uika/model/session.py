@@ -1,0 +1,62 @@
+"""One head from a growing set of photos: each new photo costs what is new about it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from uika.model.features import Keep, ViewFeatures
+from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
+from uika.model.reconstructor import Reconstructor
+from uika.model.transformer import ContextMemory
+
+
+class Session:
+    """Photos of one head added one after the other, their features and contexts kept.
+
+    `add` encodes the new photos alone and lets them and the UV tokens read the earlier photos, whose own contexts stay
+    what they were: an approximation that ends with `refresh`, which runs the transformer over everything again.
+    """
+
+    def __init__(self, model: Reconstructor, texel: Tensor, surface: SurfaceTexels, keep: Keep = "foreground") -> None:
+        """Arguments as in `Reconstructor.forward`; the surface belongs to one head, its batch dimension is 1."""
+        self.model = model
+        self.texel = texel
+        self.surface = surface
+        self.keep: Keep = keep
+        self._views: list[ViewFeatures] = []
+        self._memory = ContextMemory()
+
+    def __len__(self) -> int:
+        """The number of photos."""
+        return len(self._views)
+
+    @torch.no_grad()
+    def add(
+        self, images: Tensor, masks: Tensor, pixel_uv: Tensor, pixel_weight: Tensor | None = None
+    ) -> CanonicalGaussians:
+        """The head from all photos so far and V new ones; shapes [1,V,...] as in `Reconstructor.forward`.
+
+        Raises ValueError for shapes that do not fit.
+        """
+        self.model.check(images, self.texel, self.surface)
+        if len(images) != 1:
+            raise ValueError(f"images must be [1,V,3,H,W], the photos of one head, got {list(images.shape)}")
+        new = self.model.encode(images, masks, pixel_uv, pixel_weight, self.keep)[0]
+        reused = len(self)
+        self._views += new
+        return self._decode(reused, len(new))
+
+    @torch.no_grad()
+    def refresh(self) -> CanonicalGaussians:
+        """The head as if all photos had come at once.
+
+        Raises ValueError when there are none.
+        """
+        if not self._views:
+            raise ValueError("the session has no photos yet: add some first")
+        self._memory = ContextMemory()
+        return self._decode(len(self), len(self))
+
+    def _decode(self, reused: int, newcomers: int) -> CanonicalGaussians:
+        return self.model.decode([self._views], self.texel, self.surface, self.keep, reused, self._memory, newcomers)
