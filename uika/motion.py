@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from uika.errors import UikaError
+from uika.files import check_output, replacing
 from uika.head import HeadModel, HeadParameters
 
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
@@ -119,6 +120,24 @@ def load_motion(path: str | Path, head: HeadModel) -> Motion:
         raise MotionError(f"{source}: {error}") from error
 
 
+def save_motion(motion: Motion, path: str | Path, head: HeadModel) -> None:
+    """Write a motion file that `load_motion` reads back bit for bit, also for another head with the same actions.
+
+    Raises:
+        MotionError: the motion does not fit the head.
+        UikaError: the file cannot be written.
+    """
+    if motion.expression.shape[1] != len(head.expression_names):
+        raise MotionError(
+            f"the motion has {motion.expression.shape[1]} expressions; the head model '{head.id}' "
+            f"has {len(head.expression_names)}"
+        )
+    arrays = {name: value.numpy() for name, value in motion.tensors().items()}
+    names = np.array(head.expression_names, dtype=np.str_)
+    with replacing(check_output(path, ".npz")) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, fps=np.float64(motion.fps), expression_names=names, **arrays)  # type: ignore[arg-type]
+
+
 def _from_arrays(arrays: dict[str, np.ndarray], head: HeadModel) -> Motion:
     known = {f.name for f in fields(Motion)} | {"expression_names"}
     if unknown := sorted(set(arrays) - known):
@@ -130,7 +149,8 @@ def _from_arrays(arrays: dict[str, np.ndarray], head: HeadModel) -> Motion:
         if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
             raise MotionError(f"array '{name}' must hold real numbers, not {array.dtype}")
     values = {name: torch.from_numpy(array.astype(np.float32)) for name, array in arrays.items()}
-    fps = float(values.pop("fps"))
+    del values["fps"]
+    fps = float(arrays["fps"].item())  # not through single precision: 23.976 must stay what it is
     if not values or any(value.ndim == 0 for value in values.values()):
         raise MotionError("needs at least one array of frames besides 'fps', such as 'expression' [T,E]")
     if names is not None and "expression" in values:

@@ -103,7 +103,7 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
         pixel_unit=torch.ones(len(landmarks), dtype=torch.float64),
         identity_prior=IDENTITY_PRIOR[0],
     )
-    rotation, translation, focal, unit = _weak_perspective(problem, _eye_distance(exact))
+    rotation, translation, focal, unit = _weak_perspective(problem, eye_distance(exact))
     problem = replace(problem, pixel_unit=unit)
     state = LandmarkFit(
         torch.zeros(K, dtype=torch.float64),
@@ -120,7 +120,7 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
     return replace(state, error=distance.mean(-1) / problem.pixel_unit)
 
 
-def _eye_distance(head: HeadModel) -> float:
+def eye_distance(head: HeadModel) -> float:
     """Metres between the outer eye corners of the mean head."""
     points = head.landmarks(head.template)
     at = [int(torch.nonzero(head.landmark_ids == corner)[0]) for corner in EYE_CORNERS]

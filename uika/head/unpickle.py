@@ -224,7 +224,7 @@ def _dtype(record: Any) -> np.dtype:
     if dtype.kind not in "biuf":
         raise UnpickleError(f"holds an array of type '{code}'; only numbers are read")
     order = record.state[1] if isinstance(record.state, tuple) and len(record.state) > 1 else "="
-    return dtype.newbyteorder(order) if order in ("<", ">") else dtype
+    return dtype.newbyteorder(">" if order == ">" else "<")
 
 
 def _chumpy(record: _Chumpy) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,6 +44,25 @@ def face_meshes(images: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float64]
             ]
             found.append(max(faces, key=lambda face: float(np.ptp(face, axis=0).prod()), default=None))
     return found
+
+
+def follow_meshes(
+    images: Iterable[NDArray[np.uint8]],
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64] | None]]:
+    """Each image [H,W,3] of a video with the landmarks [478,2] in pixels of its face, or None where there is none.
+
+    Faster and steadier than `face_meshes`, because a face is looked for where it was in the image before.
+    """
+    with _solutions() as solutions:
+        mesh = solutions.face_mesh.FaceMesh(refine_landmarks=True, max_num_faces=1)
+        mesh.process(np.zeros((64, 64, 3), dtype=np.uint8))  # whatever it logs, it logs at the first image
+    with mesh:
+        for image in images:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = mesh.process(image).multi_face_landmarks
+            size = np.array(image.shape[1::-1], dtype=np.float64)
+            yield image, np.array([(point.x, point.y) for point in found[0].landmark]) * size if found else None
 
 
 def person_mask(image: NDArray[np.uint8]) -> NDArray[np.float32]:

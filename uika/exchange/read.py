@@ -1,0 +1,78 @@
+"""Read any known kind of motion for a given head."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from torch import Tensor
+
+from uika.exchange.arkit import read_csv, read_json
+from uika.exchange.flame import is_flame_params, read_flame_params
+from uika.head import HeadModel, load_head
+from uika.head.actions import ARKIT_ACTIONS, has_actions
+from uika.head.model import BUILTIN_PATH
+from uika.motion import Motion, MotionError, load_motion
+
+KINDS = (".npz", ".csv", ".json")
+
+
+def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = None) -> Motion:
+    """Read a motion of any known kind for `head`.
+
+    Known are our own `.npz`; FLAME parameters, one `.npz` with `expr` [T,E] or a folder with one for each frame; ARKit
+    `.csv` (Live Link Face) and `.json` (named activations). Expressions of another kind than the head's are
+    transferred with `uika.transfer`.
+
+    Args:
+        path: file or folder.
+        head: the head that will move.
+        source: the FLAME head that FLAME expressions belong to, needed when `head` has ARKit actions.
+
+    Raises:
+        MotionError: the file is missing, damaged or of an unknown kind, or a FLAME head is needed and not given.
+    """
+    place = Path(path)
+    if place.is_dir() or (place.suffix == ".npz" and is_flame_params(place)):
+        return _from_flame(read_flame_params(place), head, source, place)
+    if place.suffix == ".npz":
+        return load_motion(place, head)
+    if place.suffix.lower() == ".csv":
+        return _from_actions(read_csv(place), head)
+    if place.suffix.lower() == ".json":
+        return _from_actions(read_json(place), head)
+    raise MotionError(f"{place}: is no motion; known are {', '.join(KINDS)} and folders of FLAME parameters")
+
+
+def _from_actions(motion: Motion, head: HeadModel) -> Motion:
+    if not has_actions(head):
+        from uika.transfer import transfer
+
+        builtin = load_head(BUILTIN_PATH)
+        return transfer(_from_actions(motion, builtin), builtin, head)
+    columns = motion.expression.new_zeros(len(motion), len(head.expression_names))
+    columns[:, [head.expression_names.index(name) for name in ARKIT_ACTIONS]] = motion.expression
+    return replace(motion, expression=columns)
+
+
+def _from_flame(motion: Motion, head: HeadModel, source: HeadModel | None, place: Path) -> Motion:
+    if not has_actions(head):
+        return replace(motion, expression=_padded(motion.expression, head, place))
+    if source is None:
+        raise MotionError(
+            f"{place}: holds FLAME expressions, but the head model '{head.id}' has ARKit actions; also give the FLAME "
+            "head that they belong to (`uika head import` makes it from FLAME's own file)"
+        )
+    from uika.transfer import transfer
+
+    return transfer(replace(motion, expression=_padded(motion.expression, source, place)), source, head)
+
+
+def _padded(expression: Tensor, head: HeadModel, place: Path) -> Tensor:
+    """Columns for all of the head's expressions; what the file lacks rests."""
+    count, have = len(head.expression_names), expression.shape[1]
+    if have > count and bool((expression[:, count:] != 0).any()):
+        raise MotionError(f"{place}: uses {have} expressions; the head model '{head.id}' has {count}")
+    columns = expression.new_zeros(len(expression), count)
+    columns[:, : min(have, count)] = expression[:, :count]
+    return columns

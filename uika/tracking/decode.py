@@ -1,0 +1,60 @@
+"""Frames of a video file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uika.errors import UikaError
+
+DEFAULT_FPS = 25.0  # where the file does not say
+
+
+class VideoError(UikaError):
+    """A video that cannot be read or shows no face; the message names it."""
+
+
+def video_frames(path: str | Path) -> Iterator[NDArray[np.uint8]]:
+    """The frames [H,W,3] of a video, sRGB.
+
+    Raises:
+        VideoError: the file is missing or no video.
+    """
+    for _, rgb in decode(Path(path), colour=True):
+        yield rgb
+
+
+def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Grey [H,W] and, if asked for, colour [H,W,3] of each frame.
+
+    Raises:
+        VideoError: the file is missing or no video.
+    """
+    import av
+
+    if not path.is_file():
+        raise VideoError(f"{path}: no such video")
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise VideoError(f"{path}: has no pictures in it")
+            container.streams.video[0].thread_type = "AUTO"
+            for frame in container.decode(video=0):
+                grey: Any = frame.to_ndarray(format="gray")
+                rgb: Any = frame.to_ndarray(format="rgb24") if colour else grey[:0]
+                yield grey, rgb
+    except av.FFmpegError as error:
+        raise VideoError(f"{path}: cannot be read as a video ({error.strerror})") from error
+
+
+def frame_rate(path: Path) -> float:
+    """Frames per second."""
+    import av
+
+    with av.open(str(path)) as container:
+        rate = container.streams.video[0].average_rate
+        return float(rate) if rate else DEFAULT_FPS

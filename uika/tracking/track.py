@@ -1,0 +1,168 @@
+"""Drive a head from a video: landmarks find the face, the person's own colours follow it (see `appearance`)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from uika.correspondence.appearance import View, face_view, make_appearance
+from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
+from uika.correspondence.landmarks import LandmarkFit, eye_distance, fit_landmarks
+from uika.correspondence.turns import Array
+from uika.head import HeadModel, load_head
+from uika.motion import Motion
+from uika.progress import counted
+from uika.retime import smoothed
+from uika.tracking.colours import BLURS, follow_person, learn_person
+from uika.tracking.decode import VideoError, decode, frame_rate
+from uika.tracking.poses import poses_to_motion, without_gaps
+
+IDENTITY_FRAMES = 8  # shared identity and focal length come from these
+KEY_FRAMES = 24  # the person's colours come from these
+MAX_FRAMES = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A tracked video of T frames.
+
+    motion: expression, jaw, eyes and the head's rotation and translation as seen from the camera, smoothed.
+    identity: [K] the person's. focal: pixels, fixed. poses: per frame, as fitted. lost: frames without a face, filled
+    in between their neighbours. error: mean landmark distance in outer eye-corner distances. seconds: per stage.
+    """
+
+    motion: Motion
+    identity: Tensor
+    focal: float
+    poses: tuple[Pose, ...]
+    lost: tuple[int, ...]
+    error: float
+    size: tuple[int, int]  # width and height in pixels
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    landmarks: list[Array | None]
+    keys: dict[int, View]  # sharp views of some frames
+    fps: float
+    size: tuple[int, int]
+
+
+def track_video(
+    path: str | Path, head: HeadModel | None = None, *, smooth: bool = True, progress: bool = False
+) -> Track:
+    """Find how the head in a video moves.
+
+    Args:
+        path: any video that FFmpeg reads, with one face.
+        head: the head model to move; None loads the one that `uika.head.load_head` finds.
+        smooth: whether to take jitter out of the motion.
+        progress: whether to show progress bars on stderr.
+
+    Raises:
+        VideoError: the file is missing, unreadable, or shows no face.
+    """
+    head = load_head() if head is None else head
+    seconds: dict[str, float] = {}
+    start = time.perf_counter()
+    seen = _look(Path(path), progress)
+    found = [index for index, marks in enumerate(seen.landmarks) if marks is not None]
+    if not found:
+        raise VideoError(f"{path}: shows no face in any of its {len(seen.landmarks)} frames")
+    seconds["landmarks"] = time.perf_counter() - start
+    start = time.perf_counter()
+    centre = np.array(seen.size) / 2
+    targets = {index: marks - centre for index in found if (marks := seen.landmarks[index]) is not None}
+    fit = _shared_identity(targets, head)
+    focal, unit = float(fit.focal.median()), eye_distance(head)
+    model = frame_model(head, fit.identity, focal, unit)
+    rough, errors = _by_landmarks(model, targets, start_pose(model, fit, 0))
+    seconds["fit"] = time.perf_counter() - start
+    start = time.perf_counter()
+    person = learn_person(make_appearance(head, fit.identity, focal, unit), model, rough, targets, seen.keys)
+    frames = counted(decode(Path(path)), progress, len(seen.landmarks), "follow")
+    poses = follow_person(person, model, rough, targets, (grey for grey, _ in frames), centre)
+    seconds["follow"] = time.perf_counter() - start
+    complete = without_gaps(poses, len(seen.landmarks))
+    motion = poses_to_motion(complete, model, head, fit.identity, seen.fps)
+    return Track(
+        motion=smoothed(motion) if smooth else motion,
+        identity=fit.identity.float(),
+        focal=focal,
+        poses=tuple(complete),
+        lost=tuple(index for index in range(len(complete)) if index not in targets),
+        error=float(np.mean(errors)),
+        size=seen.size,
+        seconds=seconds,
+    )
+
+
+def _look(path: Path, progress: bool) -> _Seen:
+    """Landmarks of all frames, and views of evenly spread key frames."""
+    from uika.photo.nets import follow_meshes
+
+    landmarks: list[Array | None] = []
+    keys: dict[int, View] = {}
+    greys: list[NDArray[np.uint8]] = []
+    stride, size = 1, (0, 0)
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for grey, rgb in counted(decode(path, colour=True), progress, None, "landmarks"):
+            greys[:] = [grey]
+            yield rgb
+
+    for index, (image, marks) in enumerate(follow_meshes(pictures())):
+        if index >= MAX_FRAMES:
+            raise VideoError(f"{path}: has more than {MAX_FRAMES} frames; cut it into parts")
+        size = (image.shape[1], image.shape[0])
+        landmarks.append(marks)
+        if marks is not None and index % stride == 0:
+            keys[index] = face_view(greys[0], marks, np.array(size) / 2, BLURS[-1][0])
+        if len(keys) >= 2 * KEY_FRAMES:
+            stride *= 2
+            keys = {index: view for index, view in keys.items() if index % stride == 0}
+    if not landmarks:
+        raise VideoError(f"{path}: has no pictures in it")
+    return _Seen(landmarks, keys, frame_rate(path), size)
+
+
+def _shared_identity(targets: dict[int, Array], head: HeadModel) -> LandmarkFit:
+    """Identity and focal length from frames that look as different as possible; the first frame is among them."""
+    indices = list(targets)
+    shapes = np.stack([marks - marks.mean(0) for marks in targets.values()])
+    shapes = (shapes / np.sqrt(np.square(shapes).mean((1, 2), keepdims=True))).reshape(len(indices), -1)
+    chosen = [0]
+    distance = np.linalg.norm(shapes - shapes[0], axis=1)
+    while len(chosen) < min(IDENTITY_FRAMES, len(indices)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(shapes - shapes[chosen[-1]], axis=1))
+    return fit_landmarks(torch.tensor(np.stack([targets[indices[k]] for k in chosen])), head, 0)
+
+
+def _by_landmarks(model: FrameModel, targets: dict[int, Array], start: Pose) -> tuple[dict[int, Pose], list[float]]:
+    poses: dict[int, Pose] = {}
+    errors = []
+    pose, last = fit_frame(model, next(iter(targets.values())), start, stillness=0.0)[0], None
+    for index, target in targets.items():
+        jumped = last is not None and index - last > 1
+        if jumped:
+            pose = _placed(model, pose, target)
+        pose, error = fit_frame(model, target, pose)
+        poses[index], last = pose, index
+        errors.append(error)
+    return poses, errors
+
+
+def _placed(model: FrameModel, pose: Pose, target: Array) -> Pose:
+    """The pose moved to where the face shows up again after a gap."""
+    depth = pose.translation[2]
+    shift = target[model.ids].mean(0) * depth / model.focal - pose.translation[:2]
+    return replace(pose, translation=pose.translation + np.array([*shift, 0.0]))
