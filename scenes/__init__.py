@@ -3,6 +3,17 @@
 from scenes.compare import SplatReport, compare_splats
 from scenes.exr import read_exr, write_exr, write_png
 from scenes.render import AOVS, render
+from scenes.splats import register_plugins
 from scenes.variant import load_mitsuba
 
-__all__ = ["AOVS", "SplatReport", "compare_splats", "load_mitsuba", "read_exr", "render", "write_exr", "write_png"]
+__all__ = [
+    "AOVS",
+    "SplatReport",
+    "compare_splats",
+    "load_mitsuba",
+    "read_exr",
+    "register_plugins",
+    "render",
+    "write_exr",
+    "write_png",
+]

@@ -9,6 +9,7 @@ direction of light for each vertex.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 
 from scenes.people.glasses import Glasses, glasses_topology
 from scenes.shading import highlight, pixel_pattern, plane_points
-from scenes.stage import Stage
+from scenes.stage import Light, Stage, load_stage
 from scenes.variant import FAST_VARIANT, load_mitsuba
 from uika.head import Camera, HeadModel, project, vertex_normals
 
@@ -24,6 +25,20 @@ LABELS = ("uv", "depth", "normal", "triangle")
 _LIFT = 3e-4  # metres, from the vertex to the point that is lit: clear of its own triangles
 _RECORD = 16  # floats for each corner of the mesh
 _GLASSES_ROUGHNESS = 0.3
+
+
+@lru_cache(maxsize=8)
+def lit_stage(head: HeadModel, light: Light) -> Stage:
+    """A stage for `Shader`, which needs no image size, that has been used once.
+
+    Kernels that meet freshly loaded numbers differ in their last digits from all later ones; the first use goes here.
+    """
+    _require_fast(load_mitsuba())
+    stage = load_stage(head, 16, 16, light, "direct")
+    stage.pose(head, head.template)
+    for _ in range(2):
+        gather_light(stage, head.template, vertex_normals(head.template, head.faces), 4, 0)
+    return stage
 
 
 def gather_light(stage: Stage, points: torch.Tensor, normals: torch.Tensor, samples: int, seed: int) -> np.ndarray:
@@ -73,7 +88,7 @@ class Shader:
         """Put the pose on the stage and gather its light.
 
         Args:
-            stage: a lit scene, from `load_stage`; its lamps are used as they are set.
+            stage: a lit scene, from `lit_stage`; its lamps are used as they are set.
             head: the head model.
             vertices: [V,3] posed vertices, metres.
             texture: from `as_texture`.

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from scenes.colour import linear_to_srgb, srgb_to_linear
 from scenes.people.glasses import Glasses
 from scenes.stage import Light, Stage, load_stage
 from scenes.variant import FAST_VARIANT, load_mitsuba
@@ -82,17 +83,6 @@ def render(
     if backdrop and "mask" in aovs:
         images["mask"] = (images["triangle"] >= 0).astype(np.float32)
     return {name: images[name] for name in aovs}
-
-
-def srgb_to_linear(values: np.ndarray) -> np.ndarray:
-    """Decode sRGB values in [0,1] (IEC 61966-2-1)."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(values: np.ndarray) -> np.ndarray:
-    """Encode linear values as sRGB, clipped to [0,1]."""
-    v = np.clip(values, 0, 1)
-    return np.where(v <= 0.0031308, v * 12.92, 1.055 * v ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def _radiance(stage: Stage, spp: int, seed: int, with_colour: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import torch
 
 from scenes.geometry import SeamMesh, cut_seams
 from scenes.people.glasses import Glasses, glasses_topology
-from scenes.variant import load_mitsuba
+from scenes.variant import load_mitsuba, single_threaded
 from uika.head import Camera, HeadModel
 
 Light = Literal["studio", "environment", "flat", "side", "portrait"]
@@ -78,13 +78,22 @@ class Stage:
         glasses: Glasses | None = None,
     ) -> None:
         """Set head vertices [V,3] in metres and glasses, shaded for a viewer at `eye` [3], and apply all changes."""
-        self._set("head.vertex_positions", self.mesh.positions(vertices))
-        if eye is not None and "head.vertex_normals" in self.params:
-            self._set("head.vertex_normals", self.mesh.normals(vertices, head.faces, eye))
+        bent = eye is not None and "head.vertex_normals" in self.params
+        normals = self.mesh.normals(vertices, head.faces, eye) if bent and eye is not None else None
+        # Mitsuba tells distant lamps the size of the scene one update late; they aim shadow rays with it, and a picture
+        # must not depend on what stood here before.
+        for _ in range(2):
+            self._set("head.vertex_positions", self.mesh.positions(vertices))
+            if normals is not None:
+                self._set("head.vertex_normals", normals)
+            self._place_glasses(vertices, glasses)
+            with single_threaded():
+                self.params.update()
+
+    def _place_glasses(self, vertices: torch.Tensor, glasses: Glasses | None) -> None:
         if "glasses.vertex_positions" in self.params:
             hidden = vertices.mean(0).expand(len(glasses_topology()[0]), 3).numpy()
             self._set("glasses.vertex_positions", hidden if glasses is None else glasses.points)
-        self.params.update()
 
     def set_lights(self, values: Mapping[str, np.ndarray]) -> None:
         """Set the lamps by their `mi.traverse` names; takes effect with `pose`.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 
@@ -40,3 +42,23 @@ def load_mitsuba() -> ModuleType:
         if reason:
             warnings.warn(f"Mitsuba runs on {variant}, without depth, uv and triangle images: {reason}", stacklevel=2)
     return mitsuba
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let Dr.Jit and Mitsuba work in one thread.
+
+    Several threads build a ray tracing hierarchy in an order that chance decides, and with it which of two triangles a
+    ray on their common edge hits.
+    """
+    if load_mitsuba().variant() != FAST_VARIANT:
+        yield
+        return
+    import drjit as dr
+
+    count = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)

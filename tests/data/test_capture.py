@@ -150,10 +150,10 @@ def test_torn_descriptions_are_refused(capture: tuple[Path, list[dict[str, Any]]
     folder, _ = capture
     description = folder / "transforms.json"
     description.write_text(description.read_text()[:-200])
-    with pytest.raises(DataError, match="transforms.json: is not complete JSON"):
+    with pytest.raises(DataError, match=r"transforms\.json: is not complete JSON"):
         open_capture(folder)
     description.write_text('{"frames": []}')
     with pytest.raises(DataError, match="no usable frame"):
         open_capture(folder)
-    with pytest.raises(DataError, match="missing/transforms.json"):
+    with pytest.raises(DataError, match=r"missing/transforms\.json"):
         open_capture(tmp_path / "missing")

@@ -32,16 +32,15 @@ def generate_identity(
     All depends on the arguments alone. The folder holds `transforms.json` and parameter files as VHAP exports them, and
     beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`).
     """
-    from scenes.deferred import Shader, as_texture
+    from scenes.colour import linear_to_srgb
+    from scenes.deferred import Shader, as_texture, lit_stage
     from scenes.lighting import backdrop, sample_lighting
     from scenes.people import paint, sample_person, wear_glasses
     from scenes.people.hair import hair_offsets
-    from scenes.render import linear_to_srgb
-    from scenes.stage import load_stage
 
     person = sample_person(int(_random(seed, identity, "person").integers(2**31)), head)
     lighting = sample_lighting(_random(seed, identity, "light"))
-    stage = load_stage(head, 16, 16, lighting.light, "direct")
+    stage = lit_stage(head, lighting.light)
     stage.set_lights(lighting.values)
     texture = as_texture(*paint(person, head, texture_size(size)))
     offset = hair_offsets(person, head)
