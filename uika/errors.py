@@ -14,6 +14,7 @@ EXTRAS = {
     "mitsuba": "scenes",
     "OpenEXR": "scenes",
     "trimesh": "scenes",
+    "tensorboard": "train",
     "viser": "view",
 }
 

@@ -1,0 +1,34 @@
+"""Training of the reconstructor and of the correspondence estimator."""
+
+from uika.train.config import TRAINING, LossWeights, TrainConfig
+from uika.train.export import load_estimator
+from uika.train.items import Item, ItemMaker
+from uika.train.loop import MODEL_FILE, Setup, TrainingError, train
+from uika.train.parallel import Group, join_group, leave_group
+from uika.train.people import SYNTHETIC, Stored, Synthetic
+from uika.train.sampler import Draw, Sampler, SamplerConfig
+from uika.train.schedule import batch_size, learning_rate
+
+__all__ = [
+    "MODEL_FILE",
+    "SYNTHETIC",
+    "TRAINING",
+    "Draw",
+    "Group",
+    "Item",
+    "ItemMaker",
+    "LossWeights",
+    "Sampler",
+    "SamplerConfig",
+    "Setup",
+    "Stored",
+    "Synthetic",
+    "TrainConfig",
+    "TrainingError",
+    "batch_size",
+    "join_group",
+    "learning_rate",
+    "leave_group",
+    "load_estimator",
+    "train",
+]

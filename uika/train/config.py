@@ -1,0 +1,102 @@
+"""Every number of a training in one place; presets differ in values only."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from uika.errors import UikaError
+
+Part = Literal["reconstructor", "estimator"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the losses; a weight of 0 leaves the term out.
+
+    Defaults are the paper's (section 3.4) with the gradient loss in the place of LPIPS, which takes over when its
+    weights are given.
+    """
+
+    l1: float = 1.0
+    ssim: float = 0.1
+    lpips: float = 1.0
+    gradient: float = 1.0
+    offset: float = 0.1
+    entropy: float = 0.0
+    alpha: float = 0.1
+    variation: float = 0.001  # of the estimator's maps
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train one network of one preset."""
+
+    preset: str = "tiny"
+    part: Part = "reconstructor"
+    steps: int = 20000
+    seed: int = 0
+    # Data
+    sources: int = 4  # N_ref, most photos per head
+    targets: int = 3  # N_d, pictures per head to compare with
+    images: int = 4  # photos per process and step, shared by its heads
+    items: int = 2  # most heads per process and step
+    size: int = 256  # pixels of photos and pictures
+    fitted: float = 0.5  # share of heads whose correspondence comes from a landmark fit
+    augment: bool = True
+    # Optimiser
+    optimizer: Literal["adamw", "adam"] = "adamw"
+    learning_rate: float = 4e-4
+    warmup: int = 500
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 0.05
+    clip: float = 1.0  # largest norm of the gradient
+    ema: float = 0.999  # share of the running mean of the weights that stays in a step; 0 for none
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    checkpointing: bool = False  # recompute activations instead of keeping them
+    losses: LossWeights = field(default_factory=LossWeights)
+    # Keeping
+    save_every: int = 250
+    keep: int = 2  # checkpoints
+    histogram_every: int = 250
+    patience: int = 10  # steps in a row that may be skipped for values that are not finite
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work, naming the field."""
+        for name in ("steps", "sources", "targets", "images", "items", "save_every", "keep", "patience"):
+            if getattr(self, name) < 1:
+                raise UikaError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.size < 32 or self.size % 16:
+            raise UikaError(f"size must be a multiple of 16 and at least 32 pixels, not {self.size}")
+        for name in ("fitted", "ema"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UikaError(f"{name} must lie in [0,1], not {getattr(self, name)}")
+        if self.learning_rate <= 0 or self.clip <= 0 or self.warmup < 0 or self.seed < 0:
+            raise UikaError("learning_rate and clip must be positive, warmup and seed not negative")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionary for JSON."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> TrainConfig:
+        """Inverse of `to_dict`; raises UikaError for unknown fields."""
+        known = dict(values)
+        try:
+            known["losses"] = LossWeights(**known.get("losses", {}))
+            known["betas"] = tuple(known.get("betas", (0.9, 0.95)))
+            return TrainConfig(**known)
+        except TypeError as error:
+            raise UikaError(f"training config: {error}") from error
+
+
+_LARGE = {"sources": 16, "targets": 8, "images": 16, "items": 8, "size": 512, "warmup": 3000, "checkpointing": True}
+
+TRAINING: dict[str, TrainConfig] = {
+    "tiny": TrainConfig(),
+    "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
+    # The paper's recipe: no running mean, losses as printed.
+    "paper": TrainConfig(preset="paper", steps=150_000, ema=0.0, losses=LossWeights(alpha=0.0), **_LARGE),  # type: ignore[arg-type]
+}

@@ -1,0 +1,96 @@
+"""Square pictures for training out of samples of any size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from uika.data import Sample
+from uika.head import Camera
+
+_SOLID = 0.98  # mask from which a pixel shows the person alone
+_REACH = 3  # pixels that colours are continued beyond it
+_ZOOM, _SHIFT = (0.85, 1.2), 0.05  # of a jittered crop, relative to the picture
+
+
+class View:
+    """A square view: foreground colours [3,S,S], mask [S,S], camera, and the exact labels where they are known.
+
+    `image` has no backdrop: colours at the person's edge are continued from inside, to be composited with the mask.
+    """
+
+    def __init__(self, sample: Sample, size: int) -> None:
+        """Pad a sample to a square and resize it."""
+        square = _squared(sample)
+        mask = square["mask"]
+        planes = functional.interpolate(
+            torch.cat((_foreground(square["image"], mask), mask[None]))[None], size=(size, size), mode="area"
+        )[0]
+        self.image, self.mask = planes[:3], planes[3]
+        self.camera = square["camera"].resized(size, size)
+        self.key = sample.key
+        self.parameters, self.static_offset = sample.parameters, sample.static_offset
+        self.uv: Tensor | None = None
+        if "uv" in square:
+            self.uv = functional.interpolate(square["uv"][None], size=(size, size), mode="nearest-exact")[0]
+
+    def over(self, background: Tensor) -> Tensor:
+        """The picture [3,S,S] on a colour [3]."""
+        return self.image * self.mask + background[:, None, None] * (1 - self.mask)
+
+    def jitter(self, random: np.random.Generator) -> None:
+        """Crop at random; the camera follows."""
+        size = self.mask.shape[-1]
+        side = size * random.uniform(*_ZOOM)
+        x, y = ((size - side) / 2 + size * random.uniform(-_SHIFT, _SHIFT) for _ in range(2))
+        place = (torch.arange(size) + 0.5) / size * side
+        grid = torch.stack(torch.meshgrid(place + x, place + y, indexing="xy"), -1)[None] / size * 2 - 1
+        planes = torch.cat((self.image, self.mask[None]))[None]
+        smooth = functional.grid_sample(planes, grid, align_corners=False, padding_mode="zeros")[0]
+        # Colours are needed as far as the mask reaches, which has faded to nothing at the border of the picture.
+        self.image, self.mask = smooth[:3], smooth[3]
+        if self.uv is not None:
+            known = torch.where(torch.isfinite(self.uv), self.uv, -9.0)[None]
+            picked = functional.grid_sample(known, grid, mode="nearest", align_corners=False, padding_mode="zeros")[0]
+            outside = (grid[0].abs() > 1).any(-1)
+            self.uv = torch.where((picked < 0) | outside, torch.nan, picked)
+        K = self.camera.K.clone()
+        K[:2, 2] -= torch.tensor([x, y])
+        K[:2] *= size / side
+        self.camera = Camera(self.camera.viewmat, K, size, size)
+
+
+def _squared(sample: Sample) -> dict[str, Any]:
+    """Image, mask, camera and `uv` (NaN where unknown) of a sample, padded around its centre."""
+    height, width = sample.mask.shape
+    side = max(height, width)
+    left, top = (side - width) // 2, (side - height) // 2
+    pad = (left, side - width - left, top, side - height - top)
+    K = sample.camera.K.clone()
+    K[:2, 2] += torch.tensor([float(left), float(top)])
+    result: dict[str, Any] = {
+        "image": functional.pad(sample.image, pad),
+        "mask": functional.pad(sample.mask, pad),
+        "camera": Camera(sample.camera.viewmat, K, side, side),
+    }
+    if sample.uv is not None and sample.uv_valid is not None:
+        uv = torch.where(sample.uv_valid[..., None], sample.uv, torch.nan).permute(2, 0, 1)
+        result["uv"] = functional.pad(uv, pad, value=torch.nan)
+    return result
+
+
+def _foreground(image: Tensor, mask: Tensor) -> Tensor:
+    """The person's own colours [3,H,W]: pixels mixed with the backdrop take those of their neighbours inside."""
+    share = (mask >= _SOLID).float()[None]
+    colour = image * share
+    for _ in range(_REACH):
+        spread = functional.avg_pool2d(torch.cat((colour * share, share))[None], 3, 1, 1)[0]
+        mean = spread[:3] / spread[3:].clamp_min(1e-6)
+        new = (share == 0) & (spread[3:] > 0)
+        colour = torch.where(new, mean, colour)
+        share = torch.where(new, 1.0, share)
+    return torch.where(share > 0, colour, image)

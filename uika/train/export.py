@@ -1,0 +1,96 @@
+"""Model files for use, out of a training."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from uika._version import __version__
+from uika.files import replacing
+from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, save_checkpoint
+from uika.model.config import BackboneConfig
+from uika.train.checkpoint import Progress
+from uika.train.config import TrainConfig
+from uika.train.optimiser import RunningMean
+from uika.train.parallel import Group
+from uika.train.tasks import Task
+
+ESTIMATOR_FORMAT = "uika-estimator"
+_VERSION = "1"
+
+
+def export(path: Path, task: Task, mean: RunningMean, config: TrainConfig, progress: Progress, group: Group) -> None:
+    """Write the running mean of the weights as a model file, in bfloat16.
+
+    All processes must call it, since each may hold a part of the weights; the first one writes.
+    """
+    weights = {name: _gathered(value) for name, value in mean.values.items()}
+    rest = {name: _gathered(value) for name, value in task.network.state_dict().items() if name not in weights}
+    if not group.first:
+        return
+    state = {name.removeprefix("model."): value.cpu() for name, value in (weights | rest).items()}
+    provenance = {
+        "program": f"uika-drjit {__version__}",
+        "training": json.dumps(config.to_dict()),
+        "step": str(progress.step),
+    }
+    if isinstance(task.model, Reconstructor):
+        copy = Reconstructor(task.model.config)
+        copy.load_state_dict(state)
+        save_checkpoint(path, copy, torch.bfloat16, provenance)
+    elif isinstance(task.model, Estimator):
+        _save_estimator(path, task.model.config, state, provenance)
+
+
+def load_estimator(path: str | Path) -> Estimator:
+    """Read an estimator that a training wrote; weights are float32 on the CPU, the model is in eval mode.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or of another kind.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            if header.get("format") != ESTIMATOR_FORMAT or header.get("version") != _VERSION:
+                raise CheckpointError(f"{path}: not a {ESTIMATOR_FORMAT} file of version {_VERSION}")
+            config = json.loads(header["config"])
+            backbone = BackboneConfig(**_tuples(config.pop("backbone")))
+            model = Estimator(EstimatorConfig(backbone=backbone, **_tuples(config)))
+            model.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
+    except CheckpointError:
+        raise
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: cannot be read as an estimator ({error})") from error
+    return model.eval()
+
+
+def _save_estimator(path: Path, config: EstimatorConfig, state: dict[str, Tensor], provenance: dict[str, str]) -> None:
+    header = {
+        "format": ESTIMATOR_FORMAT,
+        "version": _VERSION,
+        "config": json.dumps(dataclasses.asdict(config)),
+        "provenance": json.dumps(provenance),
+    }
+    exact = ("periods", "bias_mask")  # rounding would turn angles
+    tensors = {
+        name: (value if name.endswith(exact) else value.to(torch.bfloat16)).contiguous()
+        for name, value in state.items()
+    }
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata=header)
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def _gathered(tensor: Tensor) -> Tensor:
+    whole = tensor.full_tensor() if hasattr(tensor, "full_tensor") else tensor
+    return whole.detach()

@@ -1,0 +1,263 @@
+"""One head of one step: photos as the model will meet them in use, and pictures to compare its result with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from uika.correspondence import Fit, fit_photos, pixel_uv
+from uika.data import DataError
+from uika.feeding import model_inputs
+from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
+from uika.model import PRESETS
+from uika.train.augment import degrade, draw_grade
+from uika.train.config import TrainConfig
+from uika.train.crops import View
+from uika.train.people import People, Person
+from uika.train.sampler import Draw
+
+_MIN_FACING = 0.25  # cosine between face and camera of a photo that somebody would use
+_TRIES = 3  # people tried in the place of one that cannot be read
+_BACKGROUNDS = (0.0, 0.5, 1.0, 1.0)  # grey levels behind photos; in use they are white
+_GRADE_BETWEEN = 0.15  # strength of the grades in which photos of one head differ
+_LANDMARK_BIAS, _LANDMARK_NOISE = 0.012, 0.008  # of a simulated detector, in widths of the face
+_FACE_MESH_POINTS = 478
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """One head with V photos and D pictures of S*S pixels; M Gaussians, N vertices. Everything float32."""
+
+    keys: tuple[str, ...]  # of the images it was made from
+    note: str  # what could not be read and was replaced; mostly empty
+    images: Tensor  # [V,3,S,S] photos on one colour
+    masks: Tensor  # [V,1,S,S]
+    uv: Tensor  # [V,2,S,S], NaN where unknown
+    weights: Tensor  # [V,1,S,S]
+    labels: Tensor  # [V,2,S,S] exact correspondences, NaN where unknown
+    points: Tensor  # [M,3] surface; empty for the estimator, as all below
+    quats: Tensor  # [M,4]
+    scales: Tensor  # [M,3]
+    prior: Tensor  # [3,A,A] supposed colours of the atlas
+    canonical: Tensor  # [N,3] vertices
+    posed: Tensor  # [D,N,3] vertices
+    viewmats: Tensor  # [D,4,4]
+    Ks: Tensor  # [D,3,3]
+    pictures: Tensor  # [D,3,S,S] on the colours of `backgrounds`
+    coverage: Tensor  # [D,1,S,S]
+    backgrounds: Tensor  # [D,3]
+
+    def to(self, device: torch.device) -> Item:
+        """A copy on another device."""
+        moved: dict[str, Any] = {name: v.to(device) for name, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
+
+
+class ItemMaker(torch.utils.data.Dataset[Item]):
+    """Draws -> items; the same draw always makes the same item, in whichever process."""
+
+    def __init__(self, people: People, config: TrainConfig) -> None:
+        """`people` must survive pickling."""
+        self._people, self._config = people, config
+
+    def __getitem__(self, draw: Draw) -> Item:
+        """Make one item.
+
+        Raises:
+            DataError: several people in a row cannot be used.
+        """
+        notes: list[str] = []
+        for attempt in range(_TRIES):
+            person = (draw.person + attempt) % len(self._people)
+            try:
+                return self._make(self._people[person], draw, " ".join(notes))
+            except DataError as error:
+                notes.append(str(error))
+        raise DataError(f"{_TRIES} people in a row cannot be used; the first: {notes[0]}")
+
+    def _make(self, person: Person, draw: Draw, note: str) -> Item:
+        random = np.random.default_rng(draw.seed)
+        config, head = self._config, load_head()
+        wanted = config.targets if config.part == "reconstructor" else 0
+        photos, pictures = _choose(person, draw.sources, wanted, config.size, random)
+        for view in (*photos, *pictures):
+            _check(view, head, config)
+        fitted = config.part == "reconstructor" and random.random() < config.fitted
+        if config.augment:
+            shared = draw_grade(random)
+            for view in (*photos, *pictures):
+                view.image = shared(view.image)
+            for view in photos:
+                view.jitter(random)
+                view.image = degrade(draw_grade(random, _GRADE_BETWEEN)(view.image), random)
+        grey = _BACKGROUNDS[random.integers(len(_BACKGROUNDS))] if config.augment else 1.0
+        images = torch.stack([view.over(torch.full((3,), grey)) for view in photos])
+        masks = torch.stack([view.mask for view in photos])
+        unknown = torch.full((2, config.size, config.size), torch.nan)
+        labels = torch.stack([unknown if view.uv is None else view.uv for view in photos])
+        keys = tuple(view.key for view in (*photos, *pictures))
+        none = torch.zeros(0)
+        if config.part == "estimator":
+            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 11)
+        fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
+        uv, valid, weight = pixel_uv(fit, head, masks)
+        uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
+        if not fitted:
+            # Glasses hide what the surface alone would show; a fit does not know that.
+            weight = weight * torch.isfinite(labels[:, 0]) if bool(torch.isfinite(labels).any()) else weight
+        identity = fit.parameters.identity[0]
+        architecture = PRESETS[config.preset]
+        inputs, _ = model_inputs(architecture, head, identity, fit.static_offset, images, masks, uv, weight)
+        surface = inputs.surface
+        posed, cameras = _poses(pictures, head, fit if fitted else None)
+        backgrounds = torch.from_numpy(random.choice(_BACKGROUNDS[:3], len(pictures))).float()[:, None].expand(-1, 3)
+        return Item(
+            keys=keys,
+            note=note,
+            images=images,
+            masks=masks[:, None],
+            uv=uv,
+            weights=inputs.weights[0],
+            labels=labels,
+            points=surface.points[0],
+            quats=surface.quats[0],
+            scales=surface.scales[0],
+            prior=none if surface.prior is None else surface.prior,
+            canonical=shaped_vertices(head, HeadParameters.zeros(head).replace(identity=identity), fit.static_offset),
+            posed=posed,
+            viewmats=cameras.viewmat,
+            Ks=cameras.K,
+            pictures=torch.stack([view.over(back) for view, back in zip(pictures, backgrounds, strict=True)]),
+            coverage=torch.stack([view.mask for view in pictures])[:, None],
+            backgrounds=backgrounds.contiguous(),
+        )
+
+
+def _choose(
+    person: Person, sources: int, targets: int, size: int, random: np.random.Generator
+) -> tuple[list[View], list[View]]:
+    """Photos that show the face, and pictures of any side; where a person has too few images, some are both."""
+    order = random.permutation(len(person))
+    photos: list[View] = []
+    others: list[View] = []
+    for index in order.tolist():
+        if len(photos) == sources and len(others) >= targets:
+            break
+        view = View(person.sample(index), size)
+        (photos if len(photos) < sources and _facing(view) > _MIN_FACING else others).append(view)
+    if not photos:
+        others.sort(key=_facing)
+        photos.append(others.pop())
+    pictures = others[:targets]
+    again = [View(person.sample(order[k % len(order)]), size) for k in range(targets - len(pictures))]
+    return photos, [*pictures, *again]
+
+
+def _facing(view: View) -> float:
+    """Cosine between the direction of the face and that to the camera."""
+    if view.parameters is None:
+        return 1.0
+    turn = rodrigues(view.parameters.rotation) @ rodrigues(view.parameters.neck)
+    away = view.camera.position - view.parameters.translation
+    return float(turn[:, 2] @ away / away.norm())
+
+
+def _check(view: View, head: HeadModel, config: TrainConfig) -> None:
+    if config.part == "estimator":
+        if view.uv is None:
+            raise DataError(f"{view.key}: has no correspondence image, which the estimator is trained with")
+        return
+    if view.parameters is None:
+        raise DataError(f"{view.key}: has no head parameters")
+    sizes = (len(head.identity_basis), len(head.expression_basis), len(head.template))
+    offset = len(head.template) if view.static_offset is None else len(view.static_offset)
+    found = (len(view.parameters.identity), len(view.parameters.expression), offset)
+    if found != sizes:
+        raise DataError(f"{view.key}: made for another head model (identities, expressions, vertices: {found})")
+
+
+def _exact(photos: list[View], head: HeadModel) -> Fit:
+    """The truth in the shape of a fit."""
+    parameters = HeadParameters.stack([_parameters(view) for view in photos])
+    return Fit(
+        parameters, Camera.stack([view.camera for view in photos]), _offset(photos[0], head), torch.zeros(len(photos))
+    )
+
+
+def _fit(photos: list[View], masks: Tensor, head: HeadModel, random: np.random.Generator) -> Fit:
+    """What the landmark fit makes of the photos, with landmarks as a detector might find them."""
+    found = []
+    for view, mask in zip(photos, masks, strict=True):
+        vertices = pose_vertices(head, _parameters(view), _offset(view, head))
+        pixels, _ = project(head.landmarks(vertices), view.camera)
+        width = pixels[:, 0].max() - pixels[:, 0].min()
+        bias = _LANDMARK_BIAS * _smooth_noise(head, random)
+        noise = torch.from_numpy(random.normal(0, _LANDMARK_NOISE, (len(pixels), 2))).float()
+        landmarks = torch.zeros(_FACE_MESH_POINTS, 2)
+        landmarks[head.landmark_ids] = pixels + width * (bias + noise)
+        found.append(_Photo(landmarks, mask))
+    return fit_photos(found, head, [photo.matte for photo in found])
+
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    landmarks: Tensor
+    matte: Tensor
+
+
+def _smooth_noise(head: HeadModel, random: np.random.Generator) -> Tensor:
+    """Errors [L,2] of deviation 1 that neighbouring landmarks share."""
+    place = head.landmarks(head.template) / 0.05  # wavelengths of a face's features
+    waves = torch.from_numpy(random.normal(size=(4, 3))).float()
+    phases = torch.from_numpy(random.uniform(0, 2 * np.pi, 4)).float()
+    mixture = torch.from_numpy(random.normal(size=(4, 2))).float()
+    return torch.cos(place @ waves.mT + phases) @ mixture * (2 / 4) ** 0.5
+
+
+def _poses(pictures: list[View], head: HeadModel, fit: Fit | None) -> tuple[Tensor, Camera]:
+    """Posed vertices [D,N,3] and cameras [D] of the pictures; a fitted head is put where the true one is."""
+    posed, cameras = [], []
+    for view in pictures:
+        truth = _parameters(view)
+        vertices, camera = pose_vertices(head, truth, _offset(view, head)), view.camera
+        if fit is not None:
+            own = pose_vertices(head, truth.replace(identity=fit.parameters.identity[0]), fit.static_offset)
+            camera = aligned_camera(own, vertices, head.masks["face"], camera)
+            vertices = own
+        posed.append(vertices)
+        cameras.append(camera)
+    return torch.stack(posed), Camera.stack(cameras)
+
+
+def aligned_camera(points: Tensor, target: Tensor, weight: Tensor, camera: Camera) -> Camera:
+    """The camera that sees `points` [N,3] as `camera` sees `target` [N,3], as well as a rigid motion and a scale can.
+
+    The fit cannot tell size from distance; pictures do not either, so that the camera takes up the difference.
+    """
+    share = (weight / weight.sum())[:, None].double()
+    first, second = points.double(), target.double()
+    centre, aim = (share * first).sum(0), (share * second).sum(0)
+    u, s, vt = torch.linalg.svd(((second - aim) * share).mT @ (first - centre))
+    flip = torch.ones(3, dtype=s.dtype)
+    flip[2] = torch.sign(torch.linalg.det(u @ vt))
+    rotation = (u * flip) @ vt
+    scale = (s * flip).sum() / (share * (first - centre).square()).sum()
+    shift = aim - scale * rotation @ centre
+    viewmat = camera.viewmat.double().clone()
+    outer = viewmat[:3, :3]
+    viewmat[:3, 3] = (outer @ shift + viewmat[:3, 3]) / scale
+    viewmat[:3, :3] = outer @ rotation
+    return Camera(viewmat.float(), camera.K, camera.width, camera.height)
+
+
+def _parameters(view: View) -> HeadParameters:
+    assert view.parameters is not None  # _check
+    return view.parameters
+
+
+def _offset(view: View, head: HeadModel) -> Tensor:
+    return torch.zeros_like(head.template) if view.static_offset is None else view.static_offset

@@ -1,0 +1,270 @@
+"""The training loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from uika.errors import UikaError
+from uika.head import HeadModel, load_head
+from uika.lpips import Lpips
+from uika.model import computes_bfloat16
+from uika.train.checkpoint import Checkpoints, Progress, read_progress
+from uika.train.config import TrainConfig
+from uika.train.export import export
+from uika.train.items import Item, ItemMaker
+from uika.train.logbook import Clock, Logbook
+from uika.train.optimiser import RunningMean, make_optimizer
+from uika.train.parallel import Group, Sharding, distribute
+from uika.train.people import People
+from uika.train.sampler import Draw, Sampler, SamplerConfig
+from uika.train.schedule import learning_rate
+from uika.train.tasks import Task, blocks, judge, make_task, recompute_activations
+
+MODEL_FILE = "model.safetensors"
+_PREFETCH = 4  # batches that each worker makes ahead
+_SHAPED = ("steps", "save_every", "keep", "histogram_every", "patience")  # may change when a run is continued
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How to run a training, apart from what is trained."""
+
+    output: Path
+    workers: int = 1  # processes that make items; 0 makes them in the trainer itself
+    resume: bool = False
+    overfit: int = 0  # heads that every step sees, to see whether training works at all; 0 for all people
+    sharding: Sharding = "ddp"
+    lpips: Path | None = None
+    progress: bool = True
+
+
+class TrainingError(UikaError):
+    """A training that cannot go on."""
+
+
+def train(config: TrainConfig, people: People, setup: Setup, group: Group, head: HeadModel | None = None) -> Path:
+    """Train until `config.steps` and write `model.safetensors` into the run's folder.
+
+    Args:
+        config: what to train and how.
+        people: the data.
+        setup: where, and with which help.
+        group: this process among those that train together.
+        head: the head model; None loads the one that `uika.head.load_head` finds. Items are made with that one.
+
+    Returns:
+        The model file.
+
+    Raises:
+        TrainingError: too many steps in a row were not finite.
+        UikaError: the run's folder holds another training, or nothing to resume.
+    """
+    head = load_head() if head is None else head
+    task = make_task(config, head, None if setup.lpips is None else Lpips(setup.lpips))
+    task.network.to(group.device).train()
+    if config.checkpointing:
+        recompute_activations(task)
+    network = distribute(task.network, blocks(task.model), group, setup.sharding)
+    optimizer = make_optimizer(task.network, config)
+    mean = RunningMean(task.network, config.ema)
+    checkpoints = Checkpoints(setup.output / "checkpoints", config.keep, group)
+    progress = _resume(checkpoints, config, setup, task, optimizer, mean)
+    sampler_config = SamplerConfig(
+        people=len(people),
+        seed=config.seed,
+        most_sources=config.sources,
+        images=max(config.images, setup.overfit),
+        most_items=setup.overfit or config.items,
+        fixed=setup.overfit > 0,
+    )
+    if setup.overfit:
+        sampler_config = replace(sampler_config, most_sources=1)
+    sampler = Sampler(sampler_config, group.rank, group.size, progress.step, progress.cursor)
+    book = Logbook(setup.output, progress.step, config.steps, setup.progress) if group.first else None
+    trainer = _Trainer(config, task, network, optimizer, mean, group, book)
+    batches = _batches(ItemMaker(people, config), sampler, config.steps - progress.step, setup.workers)
+    try:
+        while progress.step < config.steps:
+            progress = trainer.step(batches, progress, sampler)
+            if progress.step % config.save_every == 0 or progress.step == config.steps:
+                checkpoints.save(progress, config, task.network, optimizer, mean)
+                export(setup.output / MODEL_FILE, task, mean, config, progress, group)
+    finally:
+        if book is not None:
+            book.close()
+    return setup.output / MODEL_FILE
+
+
+class _Trainer:
+    """Steps of one training."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        task: Task,
+        network: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        mean: RunningMean,
+        group: Group,
+        book: Logbook | None,
+    ) -> None:
+        self._config, self._task, self._network = config, task, network
+        self._optimizer, self._mean, self._group, self._book = optimizer, mean, group, book
+        self._clock = Clock(group.device)
+        self._failures = 0
+
+    def step(self, batches: Iterator[list[Item]], progress: Progress, sampler: Sampler) -> Progress:
+        """Take one step; one that is not finite leaves the weights alone."""
+        clock, config = self._clock, self._config
+        with clock.stage("data"):
+            items = [item.to(self._group.device) for item in next(batches)]
+        self._note(items)
+        rate = learning_rate(progress.step, config.learning_rate, config.warmup, config.steps)
+        values, outputs = self._gradients(items)
+        with clock.stage("optimiser"):
+            parameters = [p for p in self._task.network.parameters() if p.requires_grad]
+            norm = float(_whole(nn.utils.clip_grad_norm_(parameters, config.clip)))
+            skip = self._group.any(not math.isfinite(values["loss"] + norm))
+            if not skip:
+                for options in self._optimizer.param_groups:
+                    options["lr"] = rate
+                self._optimizer.step()
+                self._mean.update(self._task.network, progress.updates)
+            self._optimizer.zero_grad(set_to_none=True)
+        self._finish(progress, values, {"learning_rate": rate, "gradient_norm": norm}, items, outputs, skip)
+        return Progress(
+            progress.step + 1, progress.updates + (not skip), sampler.advance(progress.step, progress.cursor)
+        )
+
+    def _gradients(self, items: list[Item]) -> tuple[dict[str, float], list[tuple[Tensor, ...]]]:
+        """Losses and the gradients of all parameters.
+
+        The graph is cut between network and pictures: pictures of one item are gone before those of the next are made.
+        """
+        clock = self._clock
+        with clock.stage("network"), self._arithmetic():
+            outputs = self._network(items)
+        sums: dict[str, float] = {}
+        gradients: list[Tensor] = []
+        for output, item in zip(outputs, items, strict=True):
+            leaves = tuple(tensor.detach().requires_grad_() for tensor in output)
+            with clock.stage("splat"):
+                judged = judge(self._task, leaves, item)
+            with clock.stage("splat_backward"):
+                if bool(torch.isfinite(judged.loss)):
+                    (judged.loss / len(items)).backward()
+            for name, value in {"loss": float(judged.loss.detach()), **judged.terms}.items():
+                sums[name] = sums.get(name, 0.0) + value / len(items)
+            gradients += [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+        with clock.stage("network_backward"):
+            # Also when the loss is not finite: with several processes all must come by here.
+            torch.autograd.backward([tensor for output in outputs for tensor in output], gradients)
+        return sums, outputs
+
+    def _finish(
+        self,
+        progress: Progress,
+        values: dict[str, float],
+        more: dict[str, float],
+        items: list[Item],
+        outputs: list[tuple[Tensor, ...]],
+        skip: bool,
+    ) -> None:
+        """Keep the books; stop a training that has gone astray."""
+        step, seconds = progress.step, self._clock.take()
+        self._failures = self._failures + 1 if skip else 0
+        if skip:
+            keys = [key for item in items for key in item.keys]
+            if self._book is not None:
+                self._book.skipped(step, values["loss"], keys)
+            if self._failures >= self._config.patience:
+                raise TrainingError(
+                    f"{self._failures} steps in a row were not finite, the last with images {', '.join(keys)}; "
+                    "lower learning_rate or remove these images, then go on with --resume"
+                )
+            return
+        values = self._group.mean(values)
+        if self._book is not None:
+            self._book.step(step, values | more, seconds, len(items) * self._group.size)
+            if step % self._config.histogram_every == 0:
+                self._book.histograms(step, self._task.measures(outputs[0]))
+
+    def _arithmetic(self) -> AbstractContextManager[Any]:
+        device, wanted = self._group.device, self._config.precision
+        if wanted == "bfloat16" or (wanted == "auto" and computes_bfloat16(device)):
+            return torch.autocast(device.type, torch.bfloat16)
+        return nullcontext()
+
+    def _note(self, items: list[Item]) -> None:
+        for item in items:
+            if item.note and self._book is not None:
+                self._book.say(f"replaced: {item.note}")
+
+
+def _resume(
+    checkpoints: Checkpoints,
+    config: TrainConfig,
+    setup: Setup,
+    task: Task,
+    optimizer: torch.optim.Optimizer,
+    mean: RunningMean,
+) -> Progress:
+    latest = checkpoints.latest()
+    if latest is None:
+        return Progress()
+    if not setup.resume:
+        raise UikaError(f"{setup.output}: already holds a training; add --resume to go on, or choose another folder")
+    stored, wanted = read_progress(latest)["config"], config.to_dict()
+    for name in wanted:
+        old = stored.get(name)
+        old = list(old) if isinstance(old, tuple) else old
+        new = list(wanted[name]) if isinstance(wanted[name], tuple) else wanted[name]
+        if name not in _SHAPED and old != new:
+            raise UikaError(f"{latest}: was trained with {name} {old}, not {new}; give the same values to resume")
+    return checkpoints.load(latest, task.network, optimizer, mean)
+
+
+def _batches(maker: ItemMaker, sampler: Sampler, steps: int, workers: int) -> Iterator[list[Item]]:
+    from torch.utils.data import DataLoader
+
+    order = _Order(sampler, steps)
+    if workers == 0:
+        for draws in order:
+            yield [maker[draw] for draw in draws]
+        return
+    loader = DataLoader(
+        maker,
+        batch_sampler=order,
+        num_workers=workers,
+        collate_fn=list,
+        prefetch_factor=_PREFETCH,
+        multiprocessing_context="spawn",  # a forked process cannot use Dr.Jit's threads
+    )
+    yield from loader
+
+
+class _Order:
+    """The draws that are left, for a loader's processes."""
+
+    def __init__(self, sampler: Sampler, steps: int) -> None:
+        self._sampler, self._steps = sampler, steps
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        for _, draws in zip(range(self._steps), self._sampler, strict=False):
+            yield draws
+
+    def __len__(self) -> int:
+        return self._steps
+
+
+def _whole(tensor: Tensor) -> Tensor:
+    """A tensor whose parts may lie with several processes."""
+    return tensor.full_tensor() if hasattr(tensor, "full_tensor") else tensor

@@ -1,0 +1,185 @@
+"""People to train on: captures, shards, or a generator that makes them when first asked."""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+from uika.data import DataError, Sample, open_capture
+from uika.data.capture import DESCRIPTION, parse_frame
+from uika.data.parts import build_sample, read_arrays
+from uika.data.shards import EXTENSIONS
+from uika.errors import UikaError
+
+SYNTHETIC = "synthetic"
+_OPEN = 64  # captures and shards whose descriptions stay in memory
+
+
+class Person(Protocol):
+    """The images of one person."""
+
+    def __len__(self) -> int:
+        """The number of images."""
+
+    def sample(self, index: int) -> Sample:
+        """Read one image."""
+
+
+class People(Protocol):
+    """A set of people; must survive pickling, since worker processes read from it."""
+
+    def __len__(self) -> int:
+        """The number of people."""
+
+    def __getitem__(self, index: int) -> Person:
+        """Open one of them."""
+
+
+class Shard:
+    """A tar file in webdataset layout, read at random through an index of its entries."""
+
+    def __init__(self, path: Path) -> None:
+        """Index the file.
+
+        Raises:
+            DataError: it is not a shard or holds no image.
+        """
+        self._path = path
+        self._place: dict[str, tuple[int, int]] = {}
+        try:
+            with tarfile.open(path, "r:") as archive:
+                for info in archive:
+                    self._place[info.name] = (info.offset_data, info.size)
+        except (OSError, tarfile.TarError) as error:
+            raise DataError(f"{path}: is not a readable shard ({error})") from error
+        self._keys = sorted({name.partition(".")[0] for name in self._place if name.endswith(".png")})
+        if not self._keys:
+            raise DataError(f"{path}: holds no images")
+        shared = next((name for name in self._place if name.endswith(".canonical.npz")), None)
+        self._canonical = {} if shared is None else read_arrays(self._read(shared), f"{path}/{shared}")
+
+    def __len__(self) -> int:
+        """The number of images."""
+        return len(self._keys)
+
+    def sample(self, index: int) -> Sample:
+        """Read one image.
+
+        Raises:
+            DataError: an entry cannot be used; the message names it.
+        """
+        key = self._keys[index]
+        names = {kind: f"{key}.{extension}" for kind, extension in EXTENSIONS.items()}
+        names = {kind: name for kind, name in names.items() if name in self._place}
+        try:
+            entry = json.loads(self._read(f"{key}.json"))
+        except (KeyError, ValueError) as error:
+            raise DataError(f"{self._path}/{key}.json: is missing or not complete JSON") from error
+        contents = {kind: self._read(name) for kind, name in names.items()}
+        frame = parse_frame(entry, names, f"{self._path}/{key}.json", 0)
+        return build_sample(frame, contents, self._canonical, str(self._path), key.partition("_")[0])
+
+    def _read(self, name: str) -> bytes:
+        offset, size = self._place[name]
+        with self._path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(size)
+        if len(data) != size:
+            raise DataError(f"{self._path}: is truncated; make it again")
+        return data
+
+
+@lru_cache(maxsize=_OPEN)
+def open_person(path: Path) -> Person:
+    """A capture folder or a shard, kept open for the next time."""
+    return Shard(path) if path.suffix == ".tar" else open_capture(path)
+
+
+class Stored:
+    """People on disk."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        """Find the captures and shards in folders.
+
+        A folder may be a capture itself, hold captures or shards, or be what `uika synthesize` wrote.
+
+        Raises:
+            UikaError: a folder holds none.
+        """
+        self._paths = [path for folder in folders for path in find_people(folder)]
+
+    def __len__(self) -> int:
+        """The number of people."""
+        return len(self._paths)
+
+    def __getitem__(self, index: int) -> Person:
+        """Open one of them."""
+        return open_person(self._paths[index])
+
+
+class Synthetic:
+    """Procedural people, rendered when first asked for and kept as captures."""
+
+    def __init__(
+        self, folder: Path, count: int = 1000, views: int = 9, frames: int = 3, size: int = 256, seed: int = 0
+    ) -> None:
+        """Arguments as in `uika.data.Synthesis`; `folder` keeps what was made."""
+        self._folder, self._count = folder, count
+        self._views, self._frames, self._size, self._seed = views, frames, size, seed
+
+    def __len__(self) -> int:
+        """The number of people."""
+        return self._count
+
+    def __getitem__(self, index: int) -> Person:
+        """Open one of them, and make it before if it is new."""
+        path = self._folder / f"{self._seed}-{self._views}-{self._frames}-{self._size}" / f"{index:06d}"
+        if not path.exists():
+            self._make(index, path)
+        return open_person(path)
+
+    def _make(self, index: int, path: Path) -> None:
+        import shutil
+        import tempfile
+
+        from uika.data.identity import generate_identity
+        from uika.head import load_head
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=path.parent))
+        try:
+            for name, data in generate_identity(load_head(), self._seed, index, self._views, self._frames, self._size):
+                target = partial / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(data)
+            partial.rename(path)
+        except OSError:
+            # Another process may have been faster; its files are the same.
+            if not path.exists():
+                raise
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def find_people(folder: Path) -> list[Path]:
+    """Captures and shards in a folder, sorted; captures are preferred where both hold the same people.
+
+    Raises:
+        UikaError: there are none.
+    """
+    if (folder / DESCRIPTION).is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise UikaError(f"{folder}: no such folder; give folders with captures or shards, or '{SYNTHETIC}'")
+    for root in (folder / "captures", folder):
+        captures = sorted(path.parent for path in root.glob(f"[!.]*/{DESCRIPTION}"))
+        if captures:
+            return captures
+    shards = sorted((folder / "shards").glob("*.tar")) or sorted(folder.glob("*.tar"))
+    if not shards:
+        raise UikaError(f"{folder}: holds neither captures (folders with {DESCRIPTION}) nor shards (.tar)")
+    return shards

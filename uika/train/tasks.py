@@ -1,0 +1,238 @@
+"""The two trainings: what their networks make of an item, and which losses judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from uika.complete import regions
+from uika.head import HeadModel, pose_gaussians, uv_texels
+from uika.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
+from uika.lpips import Lpips
+from uika.model import ESTIMATORS, PRESETS, Estimator, Reconstructor, SurfaceTexels, build
+from uika.surface import mirror_map
+from uika.train.config import TrainConfig
+from uika.train.items import Item
+
+
+class Task(Protocol):
+    """A network to train, and its losses."""
+
+    @property
+    def network(self) -> nn.Module:
+        """Takes a list of items; gives a tuple of tensors for each."""
+
+    @property
+    def model(self) -> nn.Module:
+        """The part of the network that is saved for use."""
+
+    def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
+        """Weighted losses of an output of the network; their sum is minimised."""
+
+    def measures(self, output: Sequence[Tensor]) -> dict[str, Tensor]:
+        """What is worth a histogram."""
+
+
+class GaussianNetwork(nn.Module):
+    """Items to Gaussians; the module that is distributed, so that its parameters are gathered on the way in."""
+
+    def __init__(self, model: Reconstructor, head: HeadModel) -> None:
+        """`head` decides the texels."""
+        super().__init__()
+        self.model = model
+        size = model.config.map_size
+        self._binding = uv_texels(head, size)
+        self._mirror, self._regions = mirror_map(head, size), regions(head, self._binding)
+
+    def forward(self, items: Sequence[Item]) -> list[tuple[Tensor, ...]]:
+        """Means, quats, scales, opacities, colours and offsets of each item."""
+        return [self._one(item) for item in items]
+
+    def _one(self, item: Item) -> tuple[Tensor, ...]:
+        device = item.images.device
+        surface = SurfaceTexels(
+            item.points[None],
+            item.quats[None],
+            item.scales[None],
+            self._mirror.to(device),
+            self._regions.to(device),
+            item.prior if len(item.prior) else None,
+        )
+        photos = (item.images[None], item.masks[None], item.uv[None], item.weights[None])
+        views = self.model.encode(*photos)
+        result = self.model.decode(views, self._binding.texel.to(device), surface)
+        tensors = (result.means, result.quats, result.scales, result.opacities, result.colors, result.offsets)
+        return tuple(tensor[0].float() for tensor in tensors)
+
+
+class ReconstructionTask:
+    """Photos to Gaussians, judged by pictures of them (paper section 3.4)."""
+
+    def __init__(self, config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None) -> None:
+        """A fresh model of the preset; `perceptual` takes the place of the gradient loss."""
+        self.model = build(PRESETS[config.preset], config.seed)
+        self.network = GaussianNetwork(self.model, head)
+        self._head, self._binding = head, uv_texels(head, self.model.config.map_size)
+        self._losses, self._perceptual = config.losses, perceptual
+
+    def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
+        """Weighted losses, and `psnr` in dB for the log."""
+        image, alpha = self.render(output, item)
+        _, _, _, opacities, _, offsets = output
+        weights = self._losses
+        terms = {
+            "l1": weights.l1 * l1(image, item.pictures),
+            "ssim": weights.ssim * ssim_loss(image, item.pictures),
+            "offset": weights.offset * offset_loss(offsets),
+        }
+        if self._perceptual is not None:
+            terms["lpips"] = weights.lpips * self._perceptual(image, item.pictures)
+        elif weights.gradient:
+            terms["gradient"] = weights.gradient * gradient_loss(image, item.pictures)
+        if weights.entropy:
+            terms["entropy"] = weights.entropy * opacity_entropy(opacities)
+        if weights.alpha:
+            terms["alpha"] = weights.alpha * alpha_loss(alpha, item.coverage)
+        square = (image.detach() - item.pictures).square().mean(dim=(1, 2, 3))
+        return terms | {"psnr": (-10 * torch.log10(square.clamp_min(1e-10))).mean()}
+
+    def render(self, output: Sequence[Tensor], item: Item) -> tuple[Tensor, Tensor]:
+        """Pictures [D,3,S,S] and coverage [D,1,S,S] of Gaussians in an item's poses; equal poses share one call."""
+        from drjit_splat import rasterization
+
+        means, quats, scales, opacities, colors, _ = output
+        binding, device = self._binding, means.device
+        images: list[Tensor | None] = [None] * len(item.pictures)
+        alphas: list[Tensor | None] = [None] * len(item.pictures)
+        for group in _same_poses(item.posed):
+            placed = pose_gaussians(
+                means,
+                quats,
+                scales,
+                item.canonical,
+                item.posed[group[0]],
+                self._head.faces.to(device),
+                binding.triangle.to(device),
+                binding.barycentric.to(device),
+            )
+            size = item.pictures.shape[-1]
+            cameras = (item.viewmats[group], item.Ks[group])
+            seen, coverage, _ = rasterization(
+                *placed, opacities, colors, *cameras, size, size, backgrounds=item.backgrounds[group]
+            )
+            for place, index in enumerate(group):
+                images[index], alphas[index] = seen[place].permute(2, 0, 1), coverage[place].permute(2, 0, 1)
+        return torch.stack([i for i in images if i is not None]), torch.stack([a for a in alphas if a is not None])
+
+    def measures(self, output: Sequence[Tensor]) -> dict[str, Tensor]:
+        """Attributes of the Gaussians."""
+        _, _, scales, opacities, colors, offsets = output
+        return {
+            "offset_mm": 1000 * offsets.norm(dim=-1),
+            "log10_scale": scales.clamp_min(1e-8).log10(),
+            "opacity": opacities,
+            "color": colors,
+        }
+
+
+class MapNetwork(nn.Module):
+    """Items to correspondence maps."""
+
+    def __init__(self, model: Estimator) -> None:
+        """Wrap the estimator."""
+        super().__init__()
+        self.model = model
+
+    def forward(self, items: Sequence[Item]) -> list[tuple[Tensor, ...]]:
+        """UV maps [V,2,S,S] of each item."""
+        return [(self.model(item.images[None])[0].float(),) for item in items]
+
+
+class EstimatorTask:
+    """Photos to correspondences, judged by exact ones (supplement A.1)."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        """A fresh model of the preset."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.model = Estimator(ESTIMATORS[config.preset])
+        self.network = MapNetwork(self.model)
+        self._losses = config.losses
+
+    def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
+        """Weighted losses, and `error`, the mean distance in thousandths of the atlas, for the log."""
+        (maps,) = output
+        known = torch.isfinite(item.labels).all(1, keepdim=True) & (item.masks > 0)
+        truth = torch.where(known, item.labels, 0.0)
+        predicted = torch.where(known, maps, 0.0)
+        share = known.float().mean().clamp_min(1e-6)
+        distance = (predicted.detach() - truth).norm(dim=1).mean() / share
+        return {
+            "l1": self._losses.l1 * l1(predicted, truth),
+            "variation": self._losses.variation * variation(maps),
+            "error": 1000 * distance,
+        }
+
+    def measures(self, output: Sequence[Tensor]) -> dict[str, Tensor]:
+        """The coordinates."""
+        return {"uv": output[0]}
+
+
+LOGGED = ("psnr", "error")  # terms that are no losses
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Sum of the losses of an item, and each by name."""
+
+    loss: Tensor
+    terms: Mapping[str, float]
+
+
+def judge(task: Task, output: Sequence[Tensor], item: Item) -> Judgement:
+    """Losses of an output; one that is not finite is not rendered and has a loss that is not finite either."""
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in output):
+        return Judgement(output[0].new_tensor(float("nan")), {})
+    terms = task.terms(output, item)
+    loss = torch.stack([value for name, value in terms.items() if name not in LOGGED]).sum()
+    return Judgement(loss, {name: float(value.detach()) for name, value in terms.items()})
+
+
+def make_task(config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None) -> Task:
+    """The task of a config."""
+    if config.part == "estimator":
+        return EstimatorTask(config)
+    return ReconstructionTask(config, head, perceptual)
+
+
+def recompute_activations(task: Task) -> None:
+    """Gradient checkpointing: blocks keep their inputs alone and run again in the backward pass."""
+    from functools import partial
+
+    from torch.utils.checkpoint import checkpoint
+
+    for block in blocks(task.model):
+        # As an attribute of the object, so that names of parameters stay as they are.
+        block.forward = partial(checkpoint, block.forward, use_reentrant=False)  # type: ignore[method-assign]
+
+
+def blocks(model: nn.Module) -> list[nn.Module]:
+    """The repeated blocks of a model."""
+    lists = [module for module in model.modules() if isinstance(module, nn.ModuleList)]
+    return [block for each in lists for block in each if len(list(block.children())) > 1]
+
+
+def _same_poses(posed: Tensor) -> list[list[int]]:
+    groups: list[list[int]] = []
+    for index, vertices in enumerate(posed):
+        for group in groups:
+            if torch.equal(posed[group[0]], vertices):
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    return groups

@@ -1,0 +1,102 @@
+"""The `train` command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from uika.errors import UikaError
+from uika.files import check_folder
+
+OVERFIT_GOAL = 35.0  # dB
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network; with several GPUs or machines start it by torchrun.
+
+    Example: uika train --preset tiny --data synthetic -o out/tiny
+    """
+
+    output: Annotated[Path, arg(aliases=["-o"])]
+    """The run's folder: checkpoints, logs and in the end model.safetensors."""
+    data: tuple[str, ...] = ("synthetic",)
+    """Folders with captures or shards, or "synthetic" to make people on the way."""
+    preset: Literal["tiny", "base", "paper"] = "tiny"
+    """Size of the network, with the training that suits it."""
+    part: Literal["reconstructor", "estimator"] = "reconstructor"
+    """Which network."""
+    steps: int | None = None
+    """Steps in all; the learning rate ends at 0 there."""
+    resume: bool = False
+    """Go on from the newest whole checkpoint."""
+    overfit: int = 0
+    """Self-test: see the same N heads at every step, unchanged."""
+    workers: int = 1
+    """Processes that make data; 0 for none."""
+    seed: int = 0
+    """Of everything random."""
+    people: int = 1000
+    """Number of synthetic people."""
+    sharding: Literal["ddp", "fsdp"] = "ddp"
+    """Several processes: each a whole network (ddp), or its parameters cut up among them (fsdp)."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    learning_rate: float | None = None
+    """The highest; the preset's own if left out."""
+    images: int | None = None
+    """Photos per step and process."""
+    size: int | None = None
+    """Side of photos and pictures in pixels."""
+    save_every: int | None = None
+    """Steps from one checkpoint to the next."""
+    lpips: Path | None = None
+    """LPIPS weights (.safetensors); without them a loss on gradients takes their place."""
+
+    def run(self) -> int:
+        """Train."""
+        check_folder(self.output)
+        from uika.train import MODEL_FILE, SYNTHETIC, TRAINING, Setup, Stored, Synthetic, join_group, leave_group, train
+        from uika.train.logbook import read_log
+
+        if self.overfit < 0 or self.workers < 0 or self.people < 1:
+            raise UikaError("overfit and workers must not be negative, people at least 1")
+        names = ("steps", "learning_rate", "images", "size", "save_every")
+        given: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        config = replace(TRAINING[self.preset], part=self.part, seed=self.seed, **given)
+        if self.overfit:
+            # The same pictures at every step and full speed soon: this is to show that gradients arrive.
+            config = replace(
+                config, augment=False, fitted=0.0, warmup=min(20, config.warmup), ema=0.0, weight_decay=0.0
+            )
+        if "steps" in given:
+            config = replace(config, warmup=min(config.warmup, max(1, config.steps // 10)))
+        if self.part == "reconstructor":
+            from uika.rendering import check_renderer
+
+            check_renderer()
+        if SYNTHETIC in self.data and len(self.data) > 1:
+            raise UikaError(f"data is either folders or '{SYNTHETIC}', not both; make folders with: uika synthesize")
+        people: Stored | Synthetic
+        if SYNTHETIC in self.data:
+            people = Synthetic(self.output / "people", self.people, size=config.size, seed=self.seed)
+        else:
+            people = Stored([Path(name) for name in self.data])
+        group = join_group(self.device)
+        try:
+            setup = Setup(
+                self.output, self.workers, self.resume, self.overfit, self.sharding, self.lpips, progress=True
+            )
+            train(config, people, setup, group)
+        finally:
+            leave_group()
+        if not group.first:
+            return 0
+        print(f"wrote {self.output / MODEL_FILE} after {config.steps} steps with {len(people):,} people")
+        if self.overfit and self.part == "reconstructor":
+            psnr = read_log(self.output)[-1]["psnr"]
+            print(f"overfit: {psnr:.1f} dB, {'reached' if psnr >= OVERFIT_GOAL else 'below'} {OVERFIT_GOAL:g} dB")
+        return 0
