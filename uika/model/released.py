@@ -247,8 +247,9 @@ def _released(name: str) -> str:
 
 
 def _fill(model: nn.Module, path: Path, names: Mapping[str, str], expected: Mapping[str, Tensor]) -> None:
-    """Give the model its tensors, under no copy where type and place fit."""
-    tensors = {new: tensor.to(expected[new].dtype) for new, tensor in _tensors(path, names)}
+    """Give the model its tensors: views of the file where all types fit, else copies that do not hold on to it."""
+    copy = any(value.dtype == torch.bfloat16 for value in expected.values())
+    tensors = {new: tensor.to(expected[new].dtype, copy=copy) for new, tensor in _tensors(path, names)}
     model.load_state_dict(tensors, strict=False, assign=True)
     model.requires_grad_(False)
 

@@ -1,0 +1,109 @@
+"""DINOv3 weights from local files, in the key formats of Hugging Face and of Meta, for a `VisionTransformer`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from uika.model.backbone import VisionTransformer
+from uika.model.checkpoint import CheckpointError, listing
+
+# Hugging Face's names on the left, ours (Meta's) on the right.
+_NAMES = {
+    "embeddings.cls_token": "cls_token",
+    "embeddings.register_tokens": "storage_tokens",
+    "embeddings.mask_token": "mask_token",
+    "embeddings.patch_embeddings.": "patch_embed.proj.",
+}
+_PARTS = {
+    "attention.o_proj": "attn.proj",
+    "layer_scale1.lambda1": "ls1.gamma",
+    "layer_scale2.lambda1": "ls2.gamma",
+    "mlp.up_proj": "mlp.fc1",
+    "mlp.down_proj": "mlp.fc2",
+}
+_QUERY_KEY_VALUE = re.compile(r"(.*)attention\.([qkv])_proj\.(weight|bias)")
+_CONVERT = (
+    "python -c 'import sys, torch, safetensors.torch as s; t = torch.load(sys.argv[1], weights_only=True); "
+    "s.save_file({k: v.contiguous() for k, v in t.items()}, sys.argv[2])'"
+)
+
+
+def load_backbone(model: VisionTransformer, path: str | Path) -> None:
+    """Fill a backbone (`Reconstructor.encoder.model`, say) with the weights of a DINOv3 safetensors file.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or a pickle, or its keys do not fit the model; it lists them.
+    """
+    path = Path(path)
+    tensors = from_any_format(_read(path))
+    expected = model.state_dict()
+    for name, value in expected.items():
+        # Hugging Face computes the periods and leaves out the keys' bias, which is switched off.
+        if name.endswith(("periods", "bias_mask")) and name not in tensors:
+            tensors[name] = value
+    problems = [
+        listing("missing", [name for name in expected if name not in tensors]),
+        listing("unknown", [name for name in tensors if name not in expected and name != "mask_token"]),
+        listing(
+            "misshapen",
+            [
+                f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
+                for name, value in expected.items()
+                if name in tensors and tensors[name].shape != value.shape
+            ],
+        ),
+    ]
+    if any(problems):
+        raise CheckpointError(f"{path}: does not fit this backbone: {'; '.join(filter(None, problems))}")
+    model.load_state_dict({name: tensors[name].float() for name in expected})
+
+
+def from_any_format(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors under Meta's names, whichever of the two formats they come in."""
+    if not any("embeddings." in name for name in tensors):
+        return {name: value for name, value in tensors.items() if not name.startswith("local_")}
+    result: dict[str, Tensor] = {}
+    thirds: dict[str, dict[str, Tensor]] = {}
+    for full, value in tensors.items():
+        name = re.sub(r"^(?:model\.|backbone\.)*", "", full)
+        if found := _QUERY_KEY_VALUE.fullmatch(name):
+            thirds.setdefault(_block(found[1]) + "attn.qkv." + found[3], {})[found[2]] = value
+        else:
+            result[_renamed(name)] = value[0] if name == "embeddings.mask_token" else value
+    for name, parts in thirds.items():
+        whole = next(iter(parts.values()))
+        result[name] = torch.cat([parts.get(part, torch.zeros_like(whole)) for part in "qkv"])
+    return result
+
+
+def _renamed(name: str) -> str:
+    for theirs, ours in _NAMES.items():
+        if name.startswith(theirs):
+            return ours + name.removeprefix(theirs)
+    name = _block(name)
+    for theirs, ours in _PARTS.items():
+        name = name.replace(theirs, ours)
+    return name
+
+
+def _block(name: str) -> str:
+    return re.sub(r"^layer\.", "blocks.", name)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such weight file; `uika weights` says where to get it")
+    if path.suffix in (".pth", ".pt", ".bin"):
+        command = f"{_CONVERT} {path} {path.with_suffix('.safetensors')}"
+        raise CheckpointError(f"{path}: is a pickle, which is not read here; convert it where you trust it: {command}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise CheckpointError(f"{path}: damaged, truncated or no safetensors file ({error})") from error
