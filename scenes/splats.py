@@ -5,8 +5,8 @@
         <integrator type="path"/>
     </integrator>
 
-The nested integrator (`direct` when none is given) draws the meshes. A splat is drawn when no mesh hides its centre, and
-what is drawn covers the meshes behind; light does not pass from one to the other.
+The nested integrator (`direct` when none is given) draws the meshes. A splat is drawn when no mesh hides its centre,
+and what is drawn covers the meshes behind; light does not pass from one to the other.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _integrator_class(mi: Any) -> Any:
             splats, left = self._splats(scene, sensor, colors)
             grad = torch.from_numpy(np.array(grad_in))
             splats.backward(grad[..., :3])
-            if dr.grad_enabled(self.colors):
+            if colors.grad is not None and dr.grad_enabled(self.colors):
                 dr.accum_grad(self.colors, mi.Float(colors.grad.numpy().ravel()))
             others = [value for name, value in params.items() if not name.endswith("colors")]
             if not any(dr.grad_enabled(value) for value in others):

@@ -1,4 +1,4 @@
-"""Splats against Mitsuba: `python -m scenes.validate -o report/` compares poses, views and gradients and says pass or fail."""
+"""Splats against Mitsuba: `python -m scenes.validate -o report/` compares poses, views and gradients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scenes.gradients import GradientReport, compare_gradients
 from scenes.render import render
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices
 
-SIZE, TEXELS, SPP = 256, 512, 16
+SIZE, TEXELS, SPP = 512, 512, 4
 VIEWS = ((0.0, 0.0), (45.0, 10.0), (-80.0, -10.0))  # yaw and pitch in degrees
 POSES = 12
 _TARGET = (0.0, -0.01, -0.03)
@@ -203,9 +203,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for reports, gradients, _ in results:
         for field in fields(ViewReport)[3:]:
             values = [getattr(report, field.name) for report in reports]
-            print(
-                f"{reports[0].head} {field.name}: median {np.median(values):.4g}, worst {_worst(field.name, values):.4g}"
-            )
+            median, worst = np.median(values), _worst(field.name, values)
+            print(f"{reports[0].head} {field.name}: median {median:.4g}, worst {worst:.4g}")
         print(f"{reports[0].head} gradients: cosine {gradients.cosine:.4f}, ratios {gradients.ratios}")
     print("passed" if passed else "failed", options.output / "index.html")
     return 0 if passed else 1

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from uika.errors import UikaError
 from uika.files import check_folder, check_output
+from uika.synthesize_command import Synthesize
 from uika.train_command import Train
 
 if TYPE_CHECKING:
@@ -177,7 +178,7 @@ class Doctor:
         return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
 
 
-Command = Reconstruct | Animate | Render | Demo | Train | Doctor
+Command = Reconstruct | Animate | Render | Demo | Train | Synthesize | Doctor
 
 
 def _check_photos(photos: tuple[Path, ...]) -> None:

@@ -2,6 +2,7 @@
 
 from uika.data.capture import Capture, open_capture
 from uika.data.prepare import PreparedView, prepare_reference, prepare_view, reference_box
+from uika.data.quality import WarpingErrors, warping_errors
 from uika.data.sample import DataError, Sample
 from uika.data.shards import read_shard, shard_samples, write_shard
 from uika.data.synthesize import Synthesis, SynthesisReport, synthesize
@@ -13,6 +14,7 @@ __all__ = [
     "Sample",
     "Synthesis",
     "SynthesisReport",
+    "WarpingErrors",
     "open_capture",
     "prepare_reference",
     "prepare_view",
@@ -20,5 +22,6 @@ __all__ = [
     "reference_box",
     "shard_samples",
     "synthesize",
+    "warping_errors",
     "write_shard",
 ]
