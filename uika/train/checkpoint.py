@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -57,7 +60,8 @@ class Checkpoints:
         self._group.wait()
         state = _state(network, optimizer, mean) | {f"random.{self._group.rank}": torch.get_rng_state()}
         writer = dcp.HuggingFaceStorageWriter(str(partial), save_distributed=True)
-        dcp.save(state, storage_writer=writer, no_dist=not dist.is_initialized())
+        with _single_process_is_fine():
+            dcp.save(state, storage_writer=writer, no_dist=not dist.is_initialized())
         self._group.wait()
         if self._group.first:
             sizes = {path.name: path.stat().st_size for path in partial.glob("*.safetensors")}
@@ -97,7 +101,8 @@ class Checkpoints:
         name = f"random.{self._group.rank}"
         if name in stored:  # not after a change of the number of processes
             state[name] = torch.get_rng_state()
-        dcp.load(state, storage_reader=reader, no_dist=not dist.is_initialized())
+        with _single_process_is_fine():
+            dcp.load(state, storage_reader=reader, no_dist=not dist.is_initialized())
         if name in stored:
             torch.set_rng_state(state[name])
         return progress
@@ -116,6 +121,13 @@ def read_progress(folder: Path) -> dict[str, Any]:
         return json.loads((folder / _PROGRESS).read_text())
     except (OSError, ValueError) as error:
         raise UikaError(f"{folder / _PROGRESS}: cannot be read ({error})") from error
+
+
+@contextmanager
+def _single_process_is_fine() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "torch.distributed is disabled", UserWarning)
+        yield
 
 
 def _state(network: nn.Module, optimizer: torch.optim.Optimizer, mean: RunningMean) -> dict[str, Tensor]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from uika.errors import UikaError
+from uika.model import PRESETS, ModelConfig
 
 Part = Literal["reconstructor", "estimator"]
 
@@ -35,6 +35,7 @@ class TrainConfig:
     """How to train one network of one preset."""
 
     preset: str = "tiny"
+    architecture: ModelConfig | None = None  # of the reconstructor in the place of the preset's, for ablations
     part: Part = "reconstructor"
     steps: int = 20000
     seed: int = 0
@@ -65,6 +66,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work, naming the field."""
+        if self.preset not in PRESETS:
+            raise UikaError(f"preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
         for name in ("steps", "sources", "targets", "images", "items", "save_every", "keep", "patience"):
             if getattr(self, name) < 1:
                 raise UikaError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -76,20 +79,14 @@ class TrainConfig:
         if self.learning_rate <= 0 or self.clip <= 0 or self.warmup < 0 or self.seed < 0:
             raise UikaError("learning_rate and clip must be positive, warmup and seed not negative")
 
+    @property
+    def model(self) -> ModelConfig:
+        """Architecture of the reconstructor."""
+        return PRESETS[self.preset] if self.architecture is None else self.architecture
+
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary for JSON."""
         return dataclasses.asdict(self)
-
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> TrainConfig:
-        """Inverse of `to_dict`; raises UikaError for unknown fields."""
-        known = dict(values)
-        try:
-            known["losses"] = LossWeights(**known.get("losses", {}))
-            known["betas"] = tuple(known.get("betas", (0.9, 0.95)))
-            return TrainConfig(**known)
-        except TypeError as error:
-            raise UikaError(f"training config: {error}") from error
 
 
 _LARGE = {"sources": 16, "targets": 8, "images": 16, "items": 8, "size": 512, "warmup": 3000, "checkpointing": True}

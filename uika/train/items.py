@@ -13,7 +13,6 @@ from uika.correspondence import Fit, fit_photos, pixel_uv
 from uika.data import DataError
 from uika.feeding import model_inputs
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
-from uika.model import PRESETS
 from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
 from uika.train.crops import View
@@ -110,8 +109,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             # Glasses hide what the surface alone would show; a fit does not know that.
             weight = weight * torch.isfinite(labels[:, 0]) if bool(torch.isfinite(labels).any()) else weight
         identity = fit.parameters.identity[0]
-        architecture = PRESETS[config.preset]
-        inputs, _ = model_inputs(architecture, head, identity, fit.static_offset, images, masks, uv, weight)
+        inputs, _ = model_inputs(config.model, head, identity, fit.static_offset, images, masks, uv, weight)
         surface = inputs.surface
         posed, cameras = _poses(pictures, head, fit if fitted else None)
         backgrounds = torch.from_numpy(random.choice(_BACKGROUNDS[:3], len(pictures))).float()[:, None].expand(-1, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -30,7 +31,7 @@ from uika.train.tasks import Task, blocks, judge, make_task, recompute_activatio
 
 MODEL_FILE = "model.safetensors"
 _PREFETCH = 4  # batches that each worker makes ahead
-_SHAPED = ("steps", "save_every", "keep", "histogram_every", "patience")  # may change when a run is continued
+_FREE = ("steps", "save_every", "keep", "histogram_every", "patience")  # may change when a run is continued
 
 
 @dataclass(frozen=True)
@@ -222,13 +223,12 @@ def _resume(
         return Progress()
     if not setup.resume:
         raise UikaError(f"{setup.output}: already holds a training; add --resume to go on, or choose another folder")
-    stored, wanted = read_progress(latest)["config"], config.to_dict()
-    for name in wanted:
-        old = stored.get(name)
-        old = list(old) if isinstance(old, tuple) else old
-        new = list(wanted[name]) if isinstance(wanted[name], tuple) else wanted[name]
-        if name not in _SHAPED and old != new:
-            raise UikaError(f"{latest}: was trained with {name} {old}, not {new}; give the same values to resume")
+    stored, wanted = read_progress(latest)["config"], json.loads(json.dumps(config.to_dict()))
+    for name, value in wanted.items():
+        if name not in _FREE and stored.get(name) != value:
+            raise UikaError(
+                f"{latest}: was trained with {name} {stored.get(name)}, not {value}; give the same values to resume"
+            )
     return checkpoints.load(latest, task.network, optimizer, mean)
 
 
@@ -236,6 +236,10 @@ def _batches(maker: ItemMaker, sampler: Sampler, steps: int, workers: int) -> It
     from torch.utils.data import DataLoader
 
     order = _Order(sampler, steps)
+    if sampler.config.fixed:
+        same = [maker[draw] for draw in next(iter(sampler))]
+        yield from (same for _ in range(steps))
+        return
     if workers == 0:
         for draws in order:
             yield [maker[draw] for draw in draws]

@@ -6,12 +6,12 @@ import math
 
 
 def learning_rate(step: int, base: float, warmup: int, steps: int) -> float:
-    """Rate of optimiser step `step` (0-based): linear warm-up, then a half cosine that reaches 0 at `steps`."""
+    """Rate of optimiser step `step` (0-based): linear warm-up, then a half cosine that is 0 in the last of `steps`."""
     if step < warmup:
         return base * (step + 1) / warmup
-    if step >= steps:
+    if step >= steps - 1:
         return 0.0
-    return base * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+    return base * 0.5 * (1 + math.cos(math.pi * (step + 1 - warmup) / (steps - warmup)))
 
 
 def batch_size(sources: int, images: int = 16, most: int = 8) -> int:

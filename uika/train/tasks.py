@@ -13,7 +13,7 @@ from uika.complete import regions
 from uika.head import HeadModel, pose_gaussians, uv_texels
 from uika.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
 from uika.lpips import Lpips
-from uika.model import ESTIMATORS, PRESETS, Estimator, Reconstructor, SurfaceTexels, build
+from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
 from uika.surface import mirror_map
 from uika.train.config import TrainConfig
 from uika.train.items import Item
@@ -74,7 +74,7 @@ class ReconstructionTask:
 
     def __init__(self, config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None) -> None:
         """A fresh model of the preset; `perceptual` takes the place of the gradient loss."""
-        self.model = build(PRESETS[config.preset], config.seed)
+        self.model = build(config.model, config.seed)
         self.network = GaussianNetwork(self.model, head)
         self._head, self._binding = head, uv_texels(head, self.model.config.map_size)
         self._losses, self._perceptual = config.losses, perceptual
