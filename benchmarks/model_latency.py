@@ -1,0 +1,244 @@
+"""Time, memory and error of the network: `python -m benchmarks.model_latency --preset tiny --views 1 4 16 -o FOLDER`.
+
+Every configuration runs the same weights on the same views of the bundled portrait's avatar. Weights are random unless
+`--model` names a trained file: speed does not depend on them, errors do. Stages are timed inside one run of the whole;
+processor seconds tell more than wall seconds when the machine is shared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from benchmarks.chart import line_chart
+from benchmarks.model_inputs import Views, make_views
+from uika.head import HeadParameters
+from uika.metrics import psnr
+from uika.model import (
+    ESTIMATORS,
+    CanonicalGaussians,
+    Estimator,
+    Reconstructor,
+    Session,
+    build,
+    computes_bfloat16,
+    load_checkpoint,
+)
+from uika.rendering import render
+
+CONFIGURATIONS = ("fp32 dense", "fp32 foreground", "bf16 dense", "bf16 foreground", "cached increment")
+
+
+@dataclass
+class Figures:
+    """One configuration at one number of views, against dense float32."""
+
+    views: int
+    configuration: str
+    wall_s: float = math.nan
+    cpu_s: float = math.nan
+    peak_gib: float = math.nan
+    stages: dict[str, float] = field(default_factory=dict)
+    means_mm: float = math.nan
+    colors: float = math.nan
+    render_psnr: float = math.nan
+    photo_psnr: float = math.nan
+    skipped_patches: float = math.nan
+
+
+def run(
+    model: Reconstructor, estimator: Estimator | None, views: Views, counts: Sequence[int], wanted: Sequence[str]
+) -> Iterator[Figures]:
+    """Measure every wanted configuration at every number of views; dense float32 comes first and is the reference."""
+    halved = {"bf16 dense", "bf16 foreground"}
+    references: dict[int, CanonicalGaussians] = {}
+    for half in (False, True):
+        names = [name for name in CONFIGURATIONS if name in wanted and (name in halved) == half]
+        if half and names:
+            model.halve()
+        for count in counts:
+            for name in names:
+                figures, result = _measure(model, estimator, views, count, name)
+                _compare(figures, result, references.setdefault(count, result), views)
+                yield figures
+
+
+def _measure(
+    model: Reconstructor, estimator: Estimator | None, views: Views, count: int, name: str
+) -> tuple[Figures, CanonicalGaussians]:
+    keep = "foreground" if "foreground" in name or "cached" in name else "all"
+    images, masks, uv, weight, texel, surface = views.inputs(count)
+    rows = (images, masks, uv, weight)
+
+    def whole() -> CanonicalGaussians:
+        if estimator is not None:
+            estimator(images)
+        return model(*rows, texel, surface, keep)
+
+    def increment() -> CanonicalGaussians:
+        if estimator is not None:
+            estimator(images[:, -1:])
+        return session.add(*(row[:, -1:] for row in rows))
+
+    task = whole
+    if name == "cached increment":
+        session = Session(model, texel, surface)
+        if count > 1:
+            session.add(*(row[:, :-1] for row in rows))
+        task = increment
+    figures = Figures(count, name)
+    with torch.no_grad(), _timed(model, estimator, figures):
+        result = task()
+    report = result.report
+    figures.skipped_patches = report["skipped_patches"] / report["patches"]
+    return figures, result
+
+
+@contextmanager
+def _timed(model: Reconstructor, estimator: Estimator | None, figures: Figures) -> Iterator[None]:
+    """Fill in wall and processor seconds, those of the stages, and peak memory."""
+    started: dict[str, float] = {}
+    handles = []
+
+    def watch(first: nn.Module, last: nn.Module, stage: str) -> None:
+        def before(*_: object) -> None:
+            started[stage] = time.process_time()
+
+        def after(*_: object) -> None:
+            now = time.process_time()
+            figures.stages[stage] = figures.stages.get(stage, 0.0) + now - started[stage]
+            started[stage] = now
+
+        handles.extend([first.register_forward_pre_hook(before), last.register_forward_hook(after)])
+
+    if estimator is not None:
+        watch(estimator, estimator, "estimator")
+    # The backbone runs by several methods, all from its patches to its norm.
+    watch(model.encoder.model.patch_embed, model.encoder.model.norm, "backbone")
+    watch(model.transformer, model.transformer, "transformer")
+    watch(model.gs_decoder, model.gs_decoder, "decoder")
+    _reset_peak()
+    wall, cpu = time.perf_counter(), time.process_time()
+    yield
+    figures.wall_s, figures.cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+    figures.peak_gib = _peak_gib()
+    figures.stages["reprojection, filling, rest"] = figures.cpu_s - sum(figures.stages.values())
+    for handle in handles:
+        handle.remove()
+
+
+def _compare(figures: Figures, result: CanonicalGaussians, reference: CanonicalGaussians, views: Views) -> None:
+    figures.means_mm = 1e3 * (result.means - reference.means).norm(dim=-1).mean().item()
+    figures.colors = (result.colors - reference.colors).abs().mean().item()
+    picture, expected = (_picture(each, views) for each in (result, reference))
+    figures.render_psnr = psnr(picture, expected)
+    figures.photo_psnr = psnr(picture, views.images[0, 0].permute(1, 2, 0))
+
+
+def _picture(result: CanonicalGaussians, views: Views) -> torch.Tensor:
+    means, quats, scales, opacities, colors = (part[0].float().contiguous() for part in result)
+    avatar = replace(
+        views.avatar, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors.clamp(0, 1)
+    )
+    params = HeadParameters.zeros(views.head).replace(identity=avatar.identity)
+    return render(avatar, params, views.cameras[0], views.head).rgb
+
+
+def _reset_peak() -> None:
+    # Linux forgets the high-water mark on this word; elsewhere the mark of the whole run has to do.
+    reset = Path("/proc/self/clear_refs")
+    if reset.exists():
+        reset.write_text("5")
+
+
+def _peak_gib() -> float:
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    if found:
+        return int(found[1]) / 2**20
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def stir(model: Reconstructor, seed: int = 0) -> None:
+    """Add noise to every matrix, so that layers which start at zero take part as after a training."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.ndim > 1:
+                spread = 0.3 / math.sqrt(parameter[0].numel())
+                parameter += spread * torch.randn(parameter.shape, generator=generator)
+
+
+def table(rows: Sequence[Figures]) -> str:
+    """Markdown; processor seconds per stage."""
+    stages = list(dict.fromkeys(stage for row in rows for stage in row.stages))
+    head = ["views", "configuration", "wall s", "CPU s", "peak GiB", *stages, "skipped", "means mm", "colour", "dB"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        cells = [str(row.views), row.configuration, f"{row.wall_s:.2f}", f"{row.cpu_s:.2f}", f"{row.peak_gib:.2f}"]
+        cells += [f"{row.stages.get(stage, 0.0):.2f}" for stage in stages]
+        cells += [f"{row.skipped_patches:.0%}", f"{row.means_mm:.4f}", f"{row.colors:.1e}", f"{row.render_psnr:.1f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _network(arguments: argparse.Namespace) -> tuple[Reconstructor, Estimator | None]:
+    if arguments.model:
+        return load_checkpoint(arguments.model), None
+    model = build(arguments.preset).eval()
+    stir(model)
+    torch.manual_seed(0)
+    return model, Estimator(ESTIMATORS[arguments.preset]).eval() if arguments.estimator else None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default="tiny", choices=sorted(ESTIMATORS))
+    parser.add_argument("--model", help="a trained model file instead of a preset with random weights")
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16, 32])
+    parser.add_argument("--configurations", nargs="+", default=list(CONFIGURATIONS), choices=CONFIGURATIONS)
+    parser.add_argument("--estimator", action="store_true", help="run the correspondence estimator too")
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/model_latency"))
+    arguments = parser.parse_args(argv)
+    wanted = [CONFIGURATIONS[0], *(name for name in arguments.configurations if name != CONFIGURATIONS[0])]
+    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__},", end=" ")
+    native = computes_bfloat16(torch.device("cpu"))
+    print("bfloat16 arithmetic" if native else "bfloat16 weights with float32 arithmetic")
+    views = make_views(max(arguments.views))
+    model, estimator = _network(arguments)
+    warm: Callable[[], object] = lambda: model(*views.inputs(1))  # noqa: E731
+    if arguments.preset != "paper":
+        with torch.no_grad():
+            warm()
+    rows = []
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for row in run(model, estimator, views, arguments.views, wanted):
+        rows.append(row)
+        print(table([row]).splitlines()[-1], flush=True)
+        (arguments.output / "figures.json").write_text(json.dumps([asdict(each) for each in rows], indent=1))
+    rows.sort(key=lambda row: (row.views, CONFIGURATIONS.index(row.configuration)))
+    text = table(rows)
+    print(text)
+    (arguments.output / "table.md").write_text(text + "\n")
+    lines = {name: [(row.views, row.cpu_s) for row in rows if row.configuration == name] for name in CONFIGURATIONS}
+    chart = line_chart({name: points for name, points in lines.items() if points}, "views", "processor seconds")
+    (arguments.output / "latency.svg").write_text(chart)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
