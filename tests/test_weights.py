@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from uika import weights
+from uika.cli import main
 
 
 def test_nothing_there(tmp_path: Path) -> None:
@@ -33,3 +34,17 @@ def test_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.Monk
     assert weights.folder() == tmp_path
     monkeypatch.delenv(weights.FOLDER_VARIABLE)
     assert weights.folder().parts[-2:] == ("uika", "weights")
+
+
+def test_command_lists_files_and_fails_on_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(weights.FOLDER_VARIABLE, str(tmp_path))
+    assert main(["weights"]) == 0
+    printed = capsys.readouterr().out
+    assert str(tmp_path) in printed
+    assert all(file.name in printed and file.licence in printed for file in weights.FILES)
+    (tmp_path / "uika.safetensors").write_bytes(b"half")
+    assert main(["weights"]) == 1
+    assert "uika.safetensors  damaged" in capsys.readouterr().out
+    assert main(["weights", "--no-verify"]) == 0

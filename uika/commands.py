@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -178,7 +178,58 @@ class Doctor:
         return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
 
 
-Command = Reconstruct | Animate | Render | Demo | Train | Synthesize | Doctor
+@dataclass(frozen=True)
+class Weights:
+    """List the pretrained weight files: purpose, licence, source, place, and whether what lies there is whole.
+
+    Example: uika weights
+    """
+
+    verify: bool = True
+    """Compare digests, which reads the files whole."""
+
+    def run(self) -> int:
+        """Print the list; nothing is fetched."""
+        from uika.weights import FOLDER_VARIABLE, check_weights, folder
+
+        print(f"weights lie in {folder()} ({FOLDER_VARIABLE} names another folder); nothing is fetched by itself")
+        found = check_weights(verify=self.verify)
+        for status in found:
+            file = status.file
+            print(f"\n{file.name}  {status.state}  {file.gigabytes:g} GB")
+            print(f"  for      {file.purpose}\n  licence  {file.licence}\n  from     {file.source}")
+        return int(any(status.state == "damaged" for status in found))
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time the network at several numbers of photos, with its memory and errors.
+
+    Example: uika bench model --views 1 4 16
+    """
+
+    what: Positional[Literal["model"]]
+    """What to measure."""
+    preset: Literal["tiny", "base", "paper"] = "tiny"
+    """Size of the network; its weights are random."""
+    views: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    """Numbers of photos."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("out/model_latency")
+    """The folder for the table and the figure."""
+
+    def run(self) -> int:
+        """Measure, which needs a checkout of the project."""
+        try:
+            from benchmarks.model_latency import main
+        except ModuleNotFoundError as error:
+            if error.name != "benchmarks":
+                raise
+            raise UikaError("bench needs the folder 'benchmarks': run it inside a checkout of the project") from error
+        counts = [str(count) for count in self.views]
+        return main(["--preset", self.preset, "--views", *counts, "-o", str(check_folder(self.output))])
+
+
+Command = Reconstruct | Animate | Render | Demo | Train | Synthesize | Weights | Bench | Doctor
 
 
 def _check_photos(photos: tuple[Path, ...]) -> None:

@@ -41,7 +41,7 @@ class WeightStatus:
 FILES = (
     WeightFile(
         name="uika.safetensors",
-        purpose="the authors' trained network, estimator and backbone included (model=PATH)",
+        purpose="the authors' trained network with its estimator and backbone (read by uika.model.released.load)",
         licence="MIT; holds FLAME-derived tables under the FLAME licence and DINOv3 weights under the DINOv3 licence",
         source="https://huggingface.co/Yuukki/UIKA",
         sha256="a1d7f56e...eb46a",
