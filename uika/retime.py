@@ -11,9 +11,9 @@ from torch import Tensor
 
 from uika.motion import Motion
 
-MIN_CUTOFF = 2.0  # hertz: what moves slower is noise unless it moves far
+MIN_CUTOFF = 5.0  # hertz: what moves slower is noise unless it moves far
 SPEED_GAIN = {  # how much faster things may pass, hertz per unit and second
-    "expression": 4.0,
+    "expression": 10.0,
     "rotation": 20.0,
     "neck": 20.0,
     "jaw": 20.0,

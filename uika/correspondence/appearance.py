@@ -33,9 +33,10 @@ VISIBLE, FACING = 0.2, 0.7  # cosines of the viewing angle between which a point
 NOISE = 0.03  # expected error of a grey level in [0,1]
 ROBUST_SCALE = 0.08  # grey levels
 CORRELATED = 3.0  # neighbouring points err together: that many count as one
-EXPRESSION_PRIOR = 1.0
+EXPRESSION_PRIOR = 5.0
 LIGHT_PRIOR = (100.0, 100.0, 100.0, 100.0)  # per squared change of gain and of its slopes over the normal
 STILLNESS = 1.0
+SYMMETRY = 10.0  # faces mostly move alike on both sides
 CONVERGED = 1e-3
 MAX_DAMPING = 1e4
 
@@ -106,10 +107,10 @@ def face_view(grey: NDArray[np.uint8], landmarks: Array, centre: Array, blur: fl
 
 def learn(appearance: Appearance, pose: Pose, view: View) -> Appearance:
     """Remember what a frame shows at the points."""
-    place, camera = _place(appearance.model, pose, view)
-    trust = _trust(appearance.model, pose, camera)
+    place, camera = place_points(appearance.model, pose, view)
+    trust = point_trust(appearance.model, pose, camera)
     total = appearance.seen + trust
-    level = appearance.seen * appearance.level + trust * _sample(view, place)[:, 0]
+    level = appearance.seen * appearance.level + trust * sample(view, place)[:, 0]
     return replace(appearance, level=level / np.maximum(total, 1e-9), seen=total)
 
 
@@ -152,7 +153,7 @@ def follow(
     return pose, error
 
 
-def _along_surface(model: FrameModel, pose: Pose, slope: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+def along_surface(model: FrameModel, pose: Pose, slope: NDArray[np.float32], out: NDArray[np.float32]) -> None:
     """Change of level by expressions and joints [M,E+3J], from the slopes [M,3] of the level in head space."""
     jacobian = landmark_jacobian(model, pose) if len(pose.joints) else model.basis[0]
     np.multiply(slope[:, :1], jacobian[:, 0], out=out, casting="same_kind")
@@ -160,19 +161,20 @@ def _along_surface(model: FrameModel, pose: Pose, slope: NDArray[np.float32], ou
         out += slope[:, axis : axis + 1] * jacobian[:, axis]
 
 
-def _place(model: FrameModel, pose: Pose, view: View) -> tuple[Array, Array]:
+def place_points(model: FrameModel, pose: Pose, view: View) -> tuple[Array, Array]:
     """Crop pixels [M,2] and camera-space points [M,3]."""
     camera = head_landmarks(model, pose) @ pose.rotation.T + pose.translation
     pixels = model.focal * camera[:, :2] / np.maximum(camera[:, 2:], 1e-6)
     return (pixels - view.corner) * view.scale, camera
 
 
-def _trust(model: FrameModel, pose: Pose, camera: Array) -> Array:
+def point_trust(model: FrameModel, pose: Pose, camera: Array) -> Array:
+    """Trust [M] in [0,1] by viewing angle."""
     cosine = -((model.normal @ pose.rotation.T) * camera).sum(-1) / np.linalg.norm(camera, axis=-1)
     return ((cosine - VISIBLE) / (FACING - VISIBLE)).clip(0, 1)
 
 
-def _sample(view: View, place: Array) -> Array:
+def sample(view: View, place: Array) -> Array:
     """Bilinear level and slopes [M,3] at crop pixels [M,2], centres at +0.5; the border repeats."""
     at = (place - 0.5).clip(0, SIDE - 1.001)
     cell = at.astype(np.int64)
@@ -194,9 +196,9 @@ def _system(
 ) -> tuple[Array, Array, float, float]:
     """Gauss-Newton matrix and gradient over pose and light, cost, and remaining error."""
     model = appearance.model
-    place, camera = _place(model, pose, view)
-    values = _sample(view, place)
-    weight = _trust(model, pose, camera) * (appearance.seen > 0.3)
+    place, camera = place_points(model, pose, view)
+    values = sample(view, place)
+    weight = point_trust(model, pose, camera) * (appearance.seen > 0.3)
     direction = np.concatenate((np.ones((len(camera), 1)), model.normal @ pose.rotation.T), -1)
     lit = appearance.level[:, None] * direction
     residual = values[:, 0] - lit @ light
@@ -209,23 +211,28 @@ def _system(
     E, P = len(pose.expression), len(travelled)
     # Single precision halves the time of the one large product; what it loses is far below the noise.
     jacobian = np.empty((len(camera), P + 4), dtype=np.float32)
-    _along_surface(model, pose, (d_camera @ pose.rotation).astype(np.float32), jacobian[:, : P - 6])
+    along_surface(model, pose, (d_camera @ pose.rotation).astype(np.float32), jacobian[:, : P - 6])
     jacobian[:, P - 6 : P - 3] = np.cross(camera - pose.translation, d_camera)
     jacobian[:, P - 3 : P] = d_camera
     jacobian[:, P:] = -root[:, None] * lit
     matrix = (jacobian.T @ jacobian).astype(np.float64)
     gradient = (jacobian.T @ (root * residual).astype(np.float32)).astype(np.float64)
     pull, change = pose.expression, pose.expression - before.expression
-    index = np.arange(E)
-    matrix[index, index] += EXPRESSION_PRIOR + STILLNESS
-    gradient[:E] += EXPRESSION_PRIOR * pull + STILLNESS * change
+    index, uneven = np.arange(E), pull - pull[model.twin]
+    matrix[index, index] += EXPRESSION_PRIOR + STILLNESS + SYMMETRY
+    matrix[index, model.twin] -= SYMMETRY
+    gradient[:E] += EXPRESSION_PRIOR * pull + STILLNESS * change + SYMMETRY * uneven
     swing = light - (1.0, 0.0, 0.0, 0.0)
     matrix[range(P, P + 4), range(P, P + 4)] += LIGHT_PRIOR
     gradient[P:] += LIGHT_PRIOR * swing
     matrix[:P, :P] += anchor[0]
     gradient[:P] += anchor[1] + anchor[0] @ travelled
     cost = float(weight @ (square * robust)) / (CORRELATED * NOISE**2) + float(np.array(LIGHT_PRIOR) @ swing**2)
-    cost += EXPRESSION_PRIOR * float(pull @ pull) + STILLNESS * float(change @ change)
+    cost += (
+        EXPRESSION_PRIOR * float(pull @ pull)
+        + SYMMETRY / 2 * float(uneven @ uneven)
+        + STILLNESS * float(change @ change)
+    )
     cost += float(2 * anchor[1] @ travelled + travelled @ anchor[0] @ travelled)
     error = float(np.sqrt((weight * square * robust).sum() / max(weight.sum(), 1e-9)))
     return matrix, gradient, cost, error

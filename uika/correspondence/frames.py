@@ -51,9 +51,12 @@ class FrameModel:
     normal: Array  # [L,3]
     weight: Array  # [L]
     free: NDArray[np.bool_]  # [E]
+    twin: NDArray[np.int64]  # [E] the same action on the other side of the face, itself where there is none
     bounded: bool
     focal: float  # pixels
     unit: float  # metres between the outer eye corners
+    triangle: torch.Tensor  # [L]
+    barycentric: torch.Tensor  # [L,3]
     ids: NDArray[np.int64]  # [L] rows of the 478-point face mesh; empty for other surface points
 
 
@@ -102,11 +105,20 @@ def surface_model(
         normal=torch.nn.functional.normalize(points(vertex_normals(neutral, exact.faces)), dim=-1).numpy(),
         weight=np.ones(len(mix)),
         free=np.array([name not in UNFITTED for name in head.expression_names]),
+        twin=_twins(head.expression_names),
         bounded=has_actions(head),
         focal=focal,
         unit=unit,
+        triangle=triangle,
+        barycentric=barycentric,
         ids=np.zeros(0, dtype=np.int64),
     )
+
+
+def _twins(names: tuple[str, ...]) -> NDArray[np.int64]:
+    swap = {"Left": "Right", "Right": "Left"}
+    other = [next((name[: -len(a)] + b for a, b in swap.items() if name.endswith(a)), name) for name in names]
+    return np.array([names.index(twin) if twin in names else index for index, twin in enumerate(other)])
 
 
 def start_pose(model: FrameModel, fit: LandmarkFit, index: int) -> Pose:
@@ -119,8 +131,8 @@ def start_pose(model: FrameModel, fit: LandmarkFit, index: int) -> Pose:
     return Pose(expression, np.tile(np.eye(3), (len(model.joints), 1, 1)), fit.rotation[index].numpy(), translation)
 
 
-def corrected(model: FrameModel, offset: Array) -> FrameModel:
-    """The model with its landmarks moved by `offset` [L,3] metres, as the detector sees them on this person."""
+def shifted(model: FrameModel, offset: Array) -> FrameModel:
+    """The model with its points moved by `offset` [L,3] metres in head space."""
     points = model.points.copy()
     points[0] += offset
     return replace(model, points=points)

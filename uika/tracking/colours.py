@@ -19,8 +19,12 @@ FIRST_STEPS, SECOND_STEPS = 8, 6  # for key frames
 
 def learn_person(
     blank: Appearance, model: FrameModel, rough: dict[int, Pose], targets: dict[int, Array], keys: dict[int, View]
-) -> Appearance:
-    """The person's colours: from the calmest frontal key frame first, then from all, each fitted to what is known."""
+) -> tuple[Appearance, dict[int, Pose]]:
+    """The person's colours: from the calmest frontal key frame first, then from all, each fitted to what is known.
+
+    Returns:
+        The colours and the poses of the key frames.
+    """
     expressions = np.stack([rough[index].expression for index in keys])
     odd = np.abs(expressions - np.median(expressions, 0)).sum(1)
     turned = np.degrees(np.arccos(np.array([-rough[index].rotation[2, 2] for index in keys]).clip(-1, 1)))
@@ -35,9 +39,9 @@ def learn_person(
     renewed = blank
     for index in order:
         pull = _pull(model, poses[index], targets[index])
-        pose, _ = follow(person, [(keys[index], SECOND_STEPS)], poses[index], poses[index], pull)
-        renewed = learn(renewed, pose, keys[index])
-    return renewed
+        poses[index], _ = follow(person, [(keys[index], SECOND_STEPS)], poses[index], poses[index], pull)
+        renewed = learn(renewed, poses[index], keys[index])
+    return renewed, poses
 
 
 def _pull(model: FrameModel, pose: Pose, target: Array) -> tuple[Array, Array]:

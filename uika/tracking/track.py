@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from uika.correspondence.appearance import View, face_view, make_appearance
+from uika.correspondence.appearance import View, face_view, learn, make_appearance
+from uika.correspondence.bundle import bundle
 from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
 from uika.correspondence.landmarks import LandmarkFit, eye_distance, fit_landmarks
 from uika.correspondence.turns import Array
@@ -20,12 +21,12 @@ from uika.head import HeadModel, load_head
 from uika.motion import Motion
 from uika.progress import counted
 from uika.retime import smoothed
-from uika.tracking.colours import BLURS, follow_person, learn_person
+from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_person
 from uika.tracking.decode import VideoError, decode, frame_rate
 from uika.tracking.poses import poses_to_motion, without_gaps
 
-IDENTITY_FRAMES = 8  # shared identity and focal length come from these
-KEY_FRAMES = 24  # the person's colours come from these
+IDENTITY_FRAMES = 12  # the first guess of identity and focal length comes from these
+KEY_FRAMES = 12  # at least; the person's colours and final identity come from these
 MAX_FRAMES = 100_000
 
 
@@ -87,16 +88,27 @@ def track_video(
     rough, errors = _by_landmarks(model, targets, start_pose(model, fit, 0))
     seconds["fit"] = time.perf_counter() - start
     start = time.perf_counter()
-    person = learn_person(make_appearance(head, fit.identity, focal, unit), model, rough, targets, seen.keys)
+    blank = make_appearance(head, fit.identity, focal, unit)
+    known = {index: rough[index] for index in seen.keys}
+    person, known = learn_person(blank, model, known, targets, seen.keys)
+    shared = bundle(head, person, model, known, seen.keys, targets, LANDMARK_PULL)
+    identity = fit.identity.clone()
+    identity[: len(shared.offset)] += torch.from_numpy(shared.offset)
+    model = frame_model(head, identity, shared.focal, unit)
+    person = make_appearance(head, identity, shared.focal, unit)
+    for index, pose in shared.poses.items():
+        person = learn(person, pose, seen.keys[index])
+    seconds["identity"] = time.perf_counter() - start
+    start = time.perf_counter()
     frames = counted(decode(Path(path)), progress, len(seen.landmarks), "follow")
     poses = follow_person(person, model, rough, targets, (grey for grey, _ in frames), centre)
     seconds["follow"] = time.perf_counter() - start
     complete = without_gaps(poses, len(seen.landmarks))
-    motion = poses_to_motion(complete, model, head, fit.identity, seen.fps)
+    motion = poses_to_motion(complete, model, head, identity, seen.fps)
     return Track(
         motion=smoothed(motion) if smooth else motion,
-        identity=fit.identity.float(),
-        focal=focal,
+        identity=identity.float(),
+        focal=shared.focal,
         poses=tuple(complete),
         lost=tuple(index for index in range(len(complete)) if index not in targets),
         error=float(np.mean(errors)),
@@ -135,16 +147,10 @@ def _look(path: Path, progress: bool) -> _Seen:
 
 
 def _shared_identity(targets: dict[int, Array], head: HeadModel) -> LandmarkFit:
-    """Identity and focal length from frames that look as different as possible; the first frame is among them."""
-    indices = list(targets)
-    shapes = np.stack([marks - marks.mean(0) for marks in targets.values()])
-    shapes = (shapes / np.sqrt(np.square(shapes).mean((1, 2), keepdims=True))).reshape(len(indices), -1)
-    chosen = [0]
-    distance = np.linalg.norm(shapes - shapes[0], axis=1)
-    while len(chosen) < min(IDENTITY_FRAMES, len(indices)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(shapes - shapes[chosen[-1]], axis=1))
-    return fit_landmarks(torch.tensor(np.stack([targets[indices[k]] for k in chosen])), head, 0)
+    """A first guess of identity and focal length from evenly spread frames; the first one is among them."""
+    marks = list(targets.values())
+    step = max(1, len(marks) // IDENTITY_FRAMES)
+    return fit_landmarks(torch.tensor(np.stack(marks[::step][: IDENTITY_FRAMES + 1])), head, 0)
 
 
 def _by_landmarks(model: FrameModel, targets: dict[int, Array], start: Pose) -> tuple[dict[int, Pose], list[float]]:
