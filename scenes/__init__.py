@@ -1,5 +1,6 @@
 """Mitsuba reference renders of the parametric head; importing this package does not load Mitsuba."""
 
+from scenes.colour import linear_to_srgb, srgb_to_linear
 from scenes.compare import SplatReport, compare_splats
 from scenes.exr import read_exr, write_exr, write_png
 from scenes.render import AOVS, render
@@ -7,6 +8,8 @@ from scenes.splats import register_plugins
 from scenes.variant import load_mitsuba
 
 __all__ = [
+    "linear_to_srgb",
+    "srgb_to_linear",
     "AOVS",
     "SplatReport",
     "compare_splats",

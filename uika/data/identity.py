@@ -17,7 +17,7 @@ from uika.data.performance import perform, place_camera, viewpoints
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, shaped_vertices, vertex_normals
 
 _SPP = 4
-_LIGHT_SAMPLES = 64
+_LIGHT_SAMPLES = (32, 64)  # for each vertex, in images below and from 256 pixels on
 _ENCODERS = 2
 _WAITING = 12  # images that may wait for an encoder
 # One stream of random numbers for each purpose, so that none depends on how often another was asked.
@@ -61,7 +61,14 @@ def generate_identity(
             glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
             samples = int(_random(seed, identity, "samples", frame).integers(2**31))
             shader = Shader(
-                stage, head, posed[frame], texture, glasses, exposure=exposure, samples=_LIGHT_SAMPLES, seed=samples
+                stage,
+                head,
+                posed[frame],
+                texture,
+                glasses,
+                exposure=exposure,
+                samples=_LIGHT_SAMPLES[size >= 256],
+                seed=samples,
             )
             for view, camera in enumerate(cameras):
                 seen = shader.view(camera, _SPP, ("uv", "depth", "triangle"))
@@ -103,7 +110,7 @@ def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor) -> float
     stage.pose(head, vertices)
     face = (head.masks["face"] > 0.5).nonzero()[:, 0]
     normals = vertex_normals(vertices, head.faces)
-    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES, 0)[:, :3]
+    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES[1], 0)[:, :3]
     return max(float(light.mean()), 1e-4)
 
 
