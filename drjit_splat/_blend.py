@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from . import constants as c
 from ._backend import PIXELS, TILE, Backend, bits_of, exp2, packet, power_of_two, smaller, write
-from ._inputs import Settings
 from ._lists import TileLists, lane_order
 from ._project import RECORD
+from ._settings import Settings
 
-RECURRENCE_EPS2D = 0.25
-"""Least low-pass (pixels^2) for which a tile's corner, from which the recurrence starts, cannot underflow: the
-exponent there is at most (sqrt(2 ln 255) + 3 sqrt(2 / eps2d))^2 / 2 nats."""
-
+UNDERFLOW = 126 * math.log(2.0)  # nats
 
 UNROLL = 2
 """List entries a turn of the loop. Every turn saves and selects all sums, and waits for its gathers, once."""
 
 SIGN = 0x80000000
+
+
+def uses_recurrence(settings: Settings) -> bool:
+    """Whether a tile's corner, from which the recurrence starts, cannot underflow where another pixel counts.
+
+    The exponent there is at most (sqrt(2 ln 1/alpha_min) + 3 sqrt(2 / eps2d))^2 / 2 nats.
+    """
+    if settings.eps2d == 0:
+        return False
+    reach = math.sqrt(-2 * math.log(settings.options.alpha_min)) + 3 * math.sqrt(2 / settings.eps2d)
+    return reach * reach / 2 <= UNDERFLOW
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,7 @@ def offsets(be: Backend, tile: Tile, geometry: list[Any]) -> tuple[Any, Any]:
     return dr.fma(geometry[3], dy, dx), dy
 
 
-def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, recurrence: bool, active: Any) -> list[Any]:
+def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, settings: Settings, active: Any) -> Iterator[Any]:
     """opacity * exp(-sigma) at the tile's 16 pixels, row by row; next to nothing in lanes that are not active
     (their geometry must be zero, or the ratios could make something of it).
 
@@ -78,23 +87,22 @@ def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, recurrence: boo
     """
     _, _, a, h, d, log_opacity, bend_x, twist = geometry
     log_opacity = dr.select(active, log_opacity, -125.0)
-    if not recurrence:
-        values = []
+    degree = settings.options.exp_degree
+    if not uses_recurrence(settings):
         for k in range(PIXELS):
             row = float(k // TILE)
             x, y = dr.fma(h, row, s + float(k % TILE)), t + row
-            values.append(exp2(be, log_opacity - dr.fma(a * x, x, d * y * y)))
-        return values
+            yield exp2(be, log_opacity - dr.fma(a * x, x, d * y * y), degree)
+        return
     ah = a * h
-    corner = exp2(be, log_opacity - dr.fma(a * s, s, d * t * t))
-    right = exp2(be, -a * dr.fma(2.0, s, 1.0))
-    down = exp2(be, -dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)))
-    bend_y = exp2(be, -2.0 * dr.fma(ah, h, d))
-    values = []
+    corner = exp2(be, log_opacity - dr.fma(a * s, s, d * t * t), degree)
+    right = exp2(be, -a * dr.fma(2.0, s, 1.0), degree)
+    down = exp2(be, -dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)), degree)
+    bend_y = exp2(be, -2.0 * dr.fma(ah, h, d), degree)
     for row in range(TILE):
         value, ratio = corner, right
         for column in range(TILE):
-            values.append(value)
+            yield value
             if column < TILE - 1:
                 value = value * ratio
             if column < TILE - 2:
@@ -103,18 +111,17 @@ def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, recurrence: boo
             corner, right = corner * down, right * twist
         if row < TILE - 2:
             down = down * bend_y
-    return values
 
 
-def clamped_alpha(raw: Any) -> Any:
-    """Opacity of a pair: held at ALPHA_MAX, nothing below ALPHA_MIN."""
-    return dr.select(raw < c.ALPHA_MIN, 0.0, smaller(raw, c.ALPHA_MAX))
+def clamped_alpha(raw: Any, settings: Settings) -> Any:
+    """Opacity of a pair: held at the largest, nothing below the smallest that counts."""
+    return dr.select(raw < settings.options.alpha_min, 0.0, smaller(raw, settings.alpha_max))
 
 
-def step(be: Backend, alpha: Any, transmittance: Any) -> tuple[Any, Any, Any]:
+def step(be: Backend, alpha: Any, transmittance: Any, settings: Settings) -> tuple[Any, Any, Any]:
     """Whether the pair is blended, its weight, and the transmittance behind it (negated once the pixel has stopped)."""
     after = dr.fma(-alpha, transmittance, transmittance)
-    alive = after > c.T_MIN
+    alive = after > settings.options.transmittance_min
     stopped = dr.reinterpret_array(be.plain.Float, bits_of(be, transmittance) | SIGN)
     return alive, dr.select(alive, alpha * transmittance, 0.0), dr.select(alive, after, stopped)
 
@@ -158,33 +165,41 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     J = be.plain
     tile = tile_of(be, lists.order, lists, settings)
     pixels = tile.pixels()
-    recurrence = settings.eps2d >= RECURRENCE_EPS2D
 
-    def body(k: Any, transmittances: list[Any], sums: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-        transmittances, sums = list(transmittances), list(sums)
+    def body(k: Any, state: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+        state = [list(pixel) for pixel in state]
+        ramps, values = [], []
         for splat, active in entries(be, lists, k, tile.last):
             geometry = packet(be, records, 2 * splat, 8, active)
-            values = read_features(be, records, splat, features, active)
-            alphas = raw_alphas(be, geometry, *offsets(be, tile, geometry), recurrence, active)
-            for p, raw in enumerate(alphas):
-                _, weight, transmittances[p] = step(be, clamped_alpha(raw), transmittances[p])
-                for f, value in enumerate(values):
-                    sums[p * features + f] = dr.fma(weight, value, sums[p * features + f])
-        return k + UNROLL, transmittances, sums
+            values.append(read_features(be, records, splat, features, active))
+            ramps.append(raw_alphas(be, geometry, *offsets(be, tile, geometry), settings, active))
+        for pixel, raws in zip(state, zip(*ramps, strict=True), strict=True):
+            for raw, value in zip(raws, values, strict=True):
+                _, weight, pixel[0] = step(be, clamped_alpha(raw, settings), pixel[0], settings)
+                for f in range(features):
+                    pixel[1 + f] = dr.fma(weight, value[f], pixel[1 + f])
+        return k + UNROLL, state
 
-    start = [dr.select(inside, J.Float(1.0), J.Float(-1.0)) for _, inside in pixels]
-    k, transmittances, sums = dr.while_loop(
-        (tile.first, start, [J.Float(0) for _ in range(PIXELS * features)]),
-        lambda k, transmittances, sums: (k < tile.last) & ~all_done(be, transmittances),
+    def go_on(k: Any, state: list[list[Any]]) -> Any:
+        left = k < tile.last
+        return left & ~all_done(be, [pixel[0] for pixel in state]) if settings.options.stop_early else left
+
+    # A pixel's transmittance and sums stay next to each other: the compiled order follows that of the state.
+    start = [
+        [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(features))] for _, inside in pixels
+    ]
+    k, state = dr.while_loop(
+        (tile.first, start),
+        go_on,
         body,
         mode="symbolic",
     )
     size = settings.width * settings.height
     image, left = dr.empty(J.Float, size * features), dr.empty(J.Float, size)
     for p, (index, inside) in enumerate(pixels):
-        write(left, dr.abs(transmittances[p]), index, inside)
+        write(left, dr.abs(state[p][0]), index, inside)
         for f in range(features):
-            write(image, sums[p * features + f], index * features + f, inside)
+            write(image, state[p][1 + f], index * features + f, inside)
     end = dr.empty(J.UInt32, lists.tiles)
     write(end, smaller(k, tile.last), tile.index, tile.used)
     dr.eval(image, left, end)

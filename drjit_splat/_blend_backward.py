@@ -6,10 +6,8 @@ from typing import Any
 
 import drjit as dr
 
-from . import constants as c
 from ._backend import TILE, Backend, add_packet, packet, power_of_two
 from ._blend import (
-    RECURRENCE_EPS2D,
     UNROLL,
     Blended,
     clamped_alpha,
@@ -20,8 +18,9 @@ from ._blend import (
     step,
     tile_of,
 )
-from ._inputs import Settings
 from ._lists import TileLists
+from ._project import RECORD
+from ._settings import Settings
 
 MOMENTS = 8  # sums of v, v s, v t, v s^2, v s t, v t^2 with v = alpha dL/dalpha, s = dx + h dy, t = dy; 2 spare
 
@@ -34,11 +33,11 @@ def blend_backward(
     features: int,
     grad_features: Any,  # [H * W * F]
     grad_coverage: Any | None,  # [H * W]
-    moments: Any,  # [>= N * MOMENTS], added to
-    grad_values: Any,  # [>= N * power_of_two(F)], added to
+    gradients: Any,  # [>= N * RECORD], added to
     settings: Settings,
 ) -> None:
-    """Add the gradients of one chunk of features to `moments` and `grad_values`.
+    """Add one chunk's gradients to `gradients`, laid out like the records: a splat's moments and then those of its
+    features share a cache line.
 
     `behind` starts as the gradient-weighted sum of everything in the pixel and loses each splat as it is passed,
     so that dL/dalpha needs neither a stored state nor a walk from the back:
@@ -47,10 +46,11 @@ def blend_backward(
     J = be.plain
     tile = tile_of(be, blended.order, lists, settings)
     stop = dr.gather(J.UInt32, blended.end, tile.index, tile.used)
-    recurrence = settings.eps2d >= RECURRENCE_EPS2D
     padded = power_of_two(features)
 
-    gradients, behind, start = [], [], []
+    ratio = RECORD // padded
+
+    image_gradients, behind, start = [], [], []
     for index, inside in tile.pixels():
         g = [dr.gather(J.Float, grad_features, index * features + f, inside) for f in range(features)]
         rest = J.Float(0)
@@ -59,7 +59,7 @@ def blend_backward(
         if grad_coverage is not None:
             left = dr.gather(J.Float, blended.transmittance, index, inside)
             rest = dr.fma(-left, dr.gather(J.Float, grad_coverage, index, inside), rest)
-        gradients.append(g)
+        image_gradients.append(g)
         behind.append(rest)
         start.append(dr.select(inside, J.Float(1.0), J.Float(-1.0)))
 
@@ -72,22 +72,23 @@ def blend_backward(
             by_value = [J.Float(0) for _ in range(features)]
             total = J.Float(0)
             slopes = []
-            for p, raw in enumerate(raw_alphas(be, geometry, s, t, recurrence, active)):
-                alpha = clamped_alpha(raw)
-                alive, weight, transmittances[p] = step(be, alpha, transmittances[p])
-                shade = values[0] * gradients[p][0]
-                by_value[0] = dr.fma(weight, gradients[p][0], by_value[0])
+            for p, raw in enumerate(raw_alphas(be, geometry, s, t, settings, active)):
+                alpha = clamped_alpha(raw, settings)
+                alive, weight, transmittances[p] = step(be, alpha, transmittances[p], settings)
+                shade = values[0] * image_gradients[p][0]
+                by_value[0] = dr.fma(weight, image_gradients[p][0], by_value[0])
                 for f in range(1, features):
-                    shade = dr.fma(values[f], gradients[p][f], shade)
-                    by_value[f] = dr.fma(weight, gradients[p][f], by_value[f])
+                    shade = dr.fma(values[f], image_gradients[p][f], shade)
+                    by_value[f] = dr.fma(weight, image_gradients[p][f], by_value[f])
                 shade *= weight
                 behind[p] -= shade
                 slope = dr.fma(-behind[p], alpha / (1.0 - alpha), shade)
-                slopes.append(dr.select(alive & (raw < c.ALPHA_MAX), slope, 0.0))
+                slopes.append(dr.select(alive & (raw < settings.alpha_max), slope, 0.0))
                 total += weight
             blended_here = total > 0.0
-            add_packet(be, moments, _moments(J, slopes, geometry[3], s, t), splat, blended_here)
-            add_packet(be, grad_values, by_value + [J.Float(0)] * (padded - features), splat, blended_here)
+            add_packet(be, gradients, _moments(J, slopes, geometry[3], s, t), 2 * splat, blended_here)
+            padding = [J.Float(0)] * (padded - features)
+            add_packet(be, gradients, by_value + padding, ratio * splat + ratio // 2, blended_here)
         return k + UNROLL, transmittances, behind
 
     dr.while_loop((tile.first, start, behind), lambda k, t, r: k < stop, body, mode="symbolic")

@@ -2,45 +2,51 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
-_C0 = 0.28209479177387814
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Values [..., (degree + 1)^2] of the harmonics in unit ``directions`` [..., 3]; degree 0 to 3."""
+    import torch
+
     x, y, z = directions.unbind(-1)
-    terms = [torch.full_like(x, _C0)]
+    terms = [torch.full_like(x, C0)]
     if degree >= 1:
-        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+        terms += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
         terms += [
-            _C2[0] * x * y,
-            -_C2[0] * y * z,
-            _C2[1] * (2 * zz - xx - yy),
-            -_C2[0] * x * z,
-            _C2[2] * (xx - yy),
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
         ]
     if degree >= 3:
         terms += [
-            -_C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            -_C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C3[2] * x * (4 * zz - xx - yy),
-            _C3[4] * z * (xx - yy),
-            -_C3[0] * x * (xx - 3 * yy),
+            -C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3[2] * x * (4 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3 * yy),
         ]
     return torch.stack(terms, dim=-1)
 
 
 def colors_seen_from(coefficients: Tensor, means: Tensor, viewmat: Tensor, degree: int) -> Tensor:
     """Colours [N, D] = max(0, 0.5 + SH) of coefficients [N, K, D] seen from the camera of ``viewmat`` [4, 4]."""
+    import torch
+
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     centre = -torch.linalg.solve(rotation, translation)
     directions = torch.nn.functional.normalize(means - centre, dim=-1)

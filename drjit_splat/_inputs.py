@@ -3,66 +3,41 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ._settings import Settings
 from .constants import MAX_CHANNELS
-
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-RASTERIZE_MODES = ("classic", "antialiased")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The arguments of one call that are not tensors."""
-
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    sh_degree: int | None
-    render_mode: str
-    rasterize_mode: str
-
-    @property
-    def has_colors(self) -> bool:
-        """Whether colour channels are rendered."""
-        return self.render_mode.startswith("RGB")
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether a depth channel is rendered (last)."""
-        return self.render_mode != "RGB"
-
-    @property
-    def expected_depth(self) -> bool:
-        """Whether the depth channel is divided by the coverage."""
-        return self.render_mode.endswith("ED")
-
-    @property
-    def antialiased(self) -> bool:
-        """Whether opacities are scaled to undo the area that the low-pass adds."""
-        return self.rasterize_mode == "antialiased"
 
 
 @dataclass(frozen=True)
 class Splats:
-    """The tensor arguments of one call after their shapes were checked."""
+    """The tensor arguments of one call."""
 
     means: Tensor  # [N, 3]
-    quats: Tensor  # [N, 4]
-    scales: Tensor  # [N, 3]
+    quats: Tensor | None  # [N, 4], with scales; None with covars
+    scales: Tensor | None  # [N, 3]
     opacities: Tensor  # [N]
-    colors: Tensor  # [N, D] or [N, K, D]
+    colors: Tensor  # [N, D] or [N, K, D], or one set a camera: [C, N, D] or [C, N, K, D]
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
-    backgrounds: Tensor | None  # [C, D]
+    backgrounds: Tensor | None = None  # [C, D]
+    covars: Tensor | None = None  # [N, 3, 3]
+
+    def to(self, dtype: torch.dtype) -> Splats:
+        """All tensors in `dtype`."""
+        converted: dict[str, Any] = {k: None if t is None else t.to(dtype) for k, t in vars(self).items()}
+        return Splats(**converted)
+
+    def colors_of(self, camera: int, settings: Settings) -> Tensor:
+        """Colours or harmonics that camera `camera` sees."""
+        shared = 2 if settings.sh_degree is None else 3
+        return self.colors if self.colors.ndim == shared else self.colors[camera]
 
 
-def _expect(name: str, tensor: Tensor, shape: tuple[int | str, ...], sizes: dict[str, int]) -> None:
+def _expect(name: str, tensor: Tensor | None, shape: tuple[int | str, ...], sizes: dict[str, int]) -> None:
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
     wanted = "[" + ", ".join(str(s) for s in shape) + "]"
@@ -80,31 +55,22 @@ def _expect(name: str, tensor: Tensor, shape: tuple[int | str, ...], sizes: dict
 def check_shapes(splats: Splats, settings: Settings) -> None:
     """Raise ValueError naming the first argument whose shape, type or value is not allowed."""
     s = settings
-    for name, size in (("width", s.width), ("height", s.height)):
-        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= 65536:
-            raise ValueError(f"{name} must be an integer from 1 to 65536, not {size!r}")
-    if not 0 <= s.near_plane < s.far_plane:
-        raise ValueError(f"near_plane must be >= 0 and below far_plane, not {s.near_plane} and {s.far_plane}")
-    if not 0 <= s.eps2d < float("inf"):
-        raise ValueError(f"eps2d must be a finite number >= 0, not {s.eps2d}")
-    if s.render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, not {s.render_mode!r}")
-    if s.rasterize_mode not in RASTERIZE_MODES:
-        raise ValueError(f"rasterize_mode must be one of {', '.join(RASTERIZE_MODES)}, not {s.rasterize_mode!r}")
+    s.check()
     sizes: dict[str, int] = {}
     _expect("means", splats.means, ("N", 3), sizes)
-    _expect("quats", splats.quats, ("N", 4), sizes)
-    _expect("scales", splats.scales, ("N", 3), sizes)
-    _expect("opacities", splats.opacities, ("N",), sizes)
-    if s.sh_degree is None:
-        _expect("colors", splats.colors, ("N", "D"), sizes)
+    if splats.covars is None:
+        _expect("quats", splats.quats, ("N", 4), sizes)
+        _expect("scales", splats.scales, ("N", 3), sizes)
     else:
-        if s.sh_degree not in (0, 1, 2, 3):
-            raise ValueError(f"sh_degree must be None or 0 to 3, not {s.sh_degree!r}")
-        _expect("colors", splats.colors, ("N", "K", "D"), sizes)
-        if sizes["K"] < (s.sh_degree + 1) ** 2:
-            needed = (s.sh_degree + 1) ** 2
-            raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {s.sh_degree} needs {needed}")
+        _expect("covars", splats.covars, ("N", 3, 3), sizes)
+    _expect("opacities", splats.opacities, ("N",), sizes)
+    own: tuple[int | str, ...] = ("N", "D") if s.sh_degree is None else ("N", "K", "D")
+    if isinstance(splats.colors, Tensor) and splats.colors.ndim == len(own) + 1:
+        own = ("C", *own)
+    _expect("colors", splats.colors, own, sizes)
+    if s.sh_degree is not None and sizes["K"] < (s.sh_degree + 1) ** 2:
+        needed = (s.sh_degree + 1) ** 2
+        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {s.sh_degree} needs {needed}")
     if not 1 <= sizes["D"] <= MAX_CHANNELS:
         raise ValueError(f"colors must have 1 to {MAX_CHANNELS} channels, not {sizes['D']}")
     _expect("viewmats", splats.viewmats, ("C", 4, 4), sizes)
@@ -127,7 +93,10 @@ def _check_cameras(splats: Splats) -> None:
         if K[0][0] <= 0 or K[1][1] <= 0:
             raise ValueError(f"Ks[{camera}] must have positive focal lengths, not {K[0][0]} and {K[1][1]}")
         if K[0][1] != 0 or K[1][0] != 0 or K[2] != [0, 0, 1]:
-            raise ValueError(f"Ks[{camera}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
+            raise ValueError(
+                f"Ks[{camera}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew ({K[0][1]}) is refused because other"
+                " rasterizers ignore it silently"
+            )
 
 
 def check_finite(**tensors: Tensor) -> None:

@@ -10,8 +10,10 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import TILE, Backend, bits_of, packet, power_of_two, smaller, write
-from ._inputs import Settings
-from ._project import Footprint, Projected
+from ._footprint import Footprint
+from ._project import Projected
+from ._settings import Settings
+from .profiling import stage
 
 DIGIT_BITS = 12  # widest digit whose bucket counts stay in the first-level cache during a counting pass
 BYTES_PER_PAIR = 24
@@ -86,15 +88,21 @@ def check_pairs(pairs: int, be: Backend) -> None:
 
 
 def _emit(
-    be: Backend, projected: Projected, order: Any, columns: Any, image_width: Any, outside: Any
+    be: Backend, projected: Projected, order: Any, columns: Any, image_width: Any, outside: Any, exact: bool
 ) -> tuple[Any, Any]:
     """Tile and splat of every pair, splats in depth order."""
     J = be.plain
     counts = dr.gather(J.UInt32, projected.counts, order)
-    dr.eval(counts)
+    clipped = smaller(counts, J.UInt32(LENGTH_BUCKETS - 1))
+    dr.eval(counts, clipped)
     begin = dr.prefix_sum(counts)
+    # The places are known, so lanes may take the splats in any order: those of a packet get equally large ones.
+    lane = dr.detail.block_mkperm(clipped, dr.width(counts), LENGTH_BUCKETS)
+    order, begin, counts = (dr.gather(J.UInt32, values, lane) for values in (order, begin, counts))
     tile, splat = dr.empty(J.UInt32, projected.pairs), dr.empty(J.UInt32, projected.pairs)
     foot = Footprint(*packet(be, projected.footprints, order, 8))
+    limits = None if projected.bounds is None else packet(be, projected.bounds, order, 2)
+    foot = replace(foot, box=not exact, limits=limits)
 
     def body(k: Any, row: Any, column: Any, last: Any) -> tuple[Any, ...]:
         # A count that disagreed with the spans could only send entries to the unused tile, never out of bounds.
@@ -159,21 +167,26 @@ def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
     check_pairs(projected.pairs, be)
     columns, rows = -(-settings.width // TILE), -(-settings.height // TILE)
     tiles = columns * rows
-    order = depth_order(be, projected)
-    tile, splat = _emit(
-        be,
-        projected,
-        order,
-        dr.opaque(J.UInt32, columns),
-        dr.opaque(J.Float, float(settings.width)),
-        dr.opaque(J.UInt32, tiles),
-    )
-    by_tile = _by_tile(be, tile, tiles, projected.pairs)
-    start = _starts(be, tile, by_tile, tiles, projected.pairs)
-    ids = dr.gather(J.UInt32, splat, by_tile)
-    dr.eval(start, ids)
-    lists = TileLists(ids, start, None, columns, rows)
-    return replace(lists, order=lane_order(be, lists.lengths(be), columns, rows))
+    with stage("sort"):
+        order = depth_order(be, projected)
+    with stage("emit"):
+        tile, splat = _emit(
+            be,
+            projected,
+            order,
+            dr.opaque(J.UInt32, columns),
+            dr.opaque(J.Float, float(settings.width)),
+            dr.opaque(J.UInt32, tiles),
+            settings.options.exact_tiles,
+        )
+    with stage("bin"):
+        by_tile = _by_tile(be, tile, tiles, projected.pairs)
+    with stage("lists"):
+        start = _starts(be, tile, by_tile, tiles, projected.pairs)
+        ids = dr.gather(J.UInt32, splat, by_tile)
+        dr.eval(start, ids)
+        lists = TileLists(ids, start, None, columns, rows)
+        return replace(lists, order=lane_order(be, lists.lengths(be), columns, rows))
 
 
 def _by_tile(be: Backend, tile: Any, tiles: int, pairs: int) -> Any:

@@ -8,6 +8,18 @@ ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 """Opacity clamp: keeps 1 - alpha away from zero, which the backward pass divides by."""
 
+ALPHA_MAX_INRIA = 0.99
+"""The same clamp under `semantics="inria"`, the rules of the original 3DGS rasterizer."""
+
+NEAR_INRIA = 0.2
+"""Depth up to which that rasterizer culls, whatever the scene's unit."""
+
+TILE_INRIA = 16
+"""Its tiles (pixels): a splat reaches every tile that its square of three standard deviations touches."""
+
+EIGENVALUE_FLOOR_INRIA = 0.1
+"""Least squared half-difference of a footprint's two variances (pixels^4) in that rasterizer's radius."""
+
 T_MIN = 1e-4
 """Blending stops before the splat that would bring the transmittance to this value or below."""
 
@@ -24,6 +36,9 @@ eps2d every determinant is >= 0.09, so this only culls splats when the low-pass 
 
 DET_MAX = 1e30
 """Largest such determinant: beyond it (a splat 10 million pixels wide) float32 products overflow."""
+
+OPACITY_FLOOR = 2.0**-100
+"""Least opacity whose logarithm is taken; far below every threshold."""
 
 COMPENSATION_MIN = 1e-10
 """Floor of the determinant ratio under the antialiasing square root, whose slope is infinite at zero. At the floor

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from . import constants as c
 from ._harmonics import colors_seen_from
-from ._inputs import Settings, Splats, check_finite, check_shapes, finish
+from ._inputs import Splats, check_finite, check_shapes, finish
+from ._settings import Options, Settings
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Projection:
     opacities: Tensor  # [N] after the antialiasing factor
     visible: Tensor  # [N] bool
     radii: Tensor  # [N, 2] pixels, integer, zero where culled
+    span: Tensor  # [N, 2, 2] first pixel and one past the last, in x and in y, that the rules allow
 
 
 def quats_to_rotations(quats: Tensor) -> Tensor:
@@ -54,13 +56,21 @@ def quats_to_rotations(quats: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
+def _root(splats: Splats) -> Tensor:
+    """A matrix [N, 3, 3] that times its transpose is the covariance of each splat."""
+    if splats.covars is not None:
+        return torch.linalg.cholesky(0.5 * (splats.covars + splats.covars.mT))
+    assert splats.quats is not None and splats.scales is not None
+    return quats_to_rotations(splats.quats) * splats.scales[:, None, :]
+
+
 def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> Projection:
     """EWA projection of all splats by one camera."""
     s = settings
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = splats.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = points[:, 2]
-    in_range = (depths > s.near_plane) & (depths < s.far_plane)
+    in_range = (depths > s.near) & (depths < s.far_plane)
     z = torch.where(in_range, depths, torch.ones_like(depths))
     slope = points[:, :2] / z[:, None]
     means2d = torch.stack([fx * slope[:, 0] + cx, fy * slope[:, 1] + cy], -1)
@@ -68,9 +78,11 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
     clamped = []
     for i, (focal, centre, size) in enumerate(((fx, cx, s.width), (fy, cy, s.height))):
         margin = c.FRUSTUM_MARGIN * 0.5 * size / focal
-        clamped.append(
-            torch.minimum(torch.maximum(slope[:, i], -centre / focal - margin), (size - centre) / focal + margin)
-        )
+        low, high = -centre / focal - margin, (size - centre) / focal + margin
+        if s.inria:  # symmetric about the optical axis, wherever the image lies
+            high = (1 + c.FRUSTUM_MARGIN) * 0.5 * size / focal
+            low = -high
+        clamped.append(torch.minimum(torch.maximum(slope[:, i], low), high))
     rows = torch.stack(
         [
             (fx / z)[:, None] * (viewmat[0, :3] - clamped[0][:, None] * viewmat[2, :3]),
@@ -78,7 +90,7 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
         ],
         dim=1,
     )
-    half = rows @ (quats_to_rotations(splats.quats) * splats.scales[:, None, :])
+    half = rows @ _root(splats)
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
     # The determinant of half @ half^T as a sum of squared minors: xx * yy - xy^2 cancels for needles.
     sharp = (torch.linalg.cross(half[:, 0], half[:, 1]) ** 2).sum(-1)
@@ -90,14 +102,27 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
     if s.antialiased:
         opacities = opacities * (sharp / determinant).clamp_min(c.COMPENSATION_MIN).sqrt()
 
-    bright = opacities.detach() >= c.ALPHA_MIN
-    reach2 = 2 * torch.log(opacities.detach().clamp_min(c.ALPHA_MIN) / c.ALPHA_MIN)
+    alpha_min = s.options.alpha_min
+    bright = opacities.detach() >= alpha_min
+    reach2 = 2 * torch.log(opacities.detach().clamp_min(alpha_min) / alpha_min)
     extent = (reach2[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
     image_size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
     on_screen = ((means2d + extent > 0.5) & (means2d - extent < image_size - 0.5)).all(-1)
-    visible = in_range & invertible & bright & on_screen & (extent.ceil() > s.radius_clip).any(-1)
-    radii = torch.where(visible[:, None], extent.ceil(), torch.zeros_like(extent)).to(torch.int32)
-    return Projection(means2d, depths, covariance, determinant, opacities, visible.detach(), radii)
+    extent = extent.ceil()
+    span = torch.stack([torch.zeros_like(extent), image_size.expand_as(extent)], -1)
+    if s.inria:
+        mean = 0.5 * (covariance[:, 0] + covariance[:, 2]).detach()
+        half_difference = (mean**2 - determinant.detach()).clamp_min(c.EIGENVALUE_FLOOR_INRIA).sqrt()
+        radius = (3 * (mean + half_difference).sqrt()).ceil()
+        extent = torch.stack([radius, radius], -1)
+        tile, corner = c.TILE_INRIA, means2d.detach() - 0.5
+        first = ((corner - extent) / tile).floor().clamp_min(0)
+        end = torch.minimum(((corner + extent + (tile - 1)) / tile).floor(), (image_size / tile).ceil())
+        span = tile * torch.stack([first, end], -1)
+        on_screen &= (first < end).all(-1)
+    visible = in_range & invertible & bright & on_screen & (extent > s.radius_clip).any(-1)
+    radii = torch.where(visible[:, None], extent, torch.zeros_like(extent)).to(torch.int32)
+    return Projection(means2d, depths, covariance, determinant, opacities, visible.detach(), radii, span)
 
 
 def _pixel_centres(settings: Settings, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,12 +155,15 @@ def blend(
     sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / p.determinant[order, None]
     raw = p.opacities[order, None] * torch.exp(-sigma)
 
-    clamped = raw.detach() > c.ALPHA_MAX if decisions is None else decisions.clamped
-    alpha = torch.where(clamped, torch.full_like(raw, c.ALPHA_MAX), raw)
-    hit = alpha.detach() >= c.ALPHA_MIN
+    alpha_min, alpha_max, t_min = settings.options.alpha_min, settings.alpha_max, settings.options.transmittance_min
+    clamped = raw.detach() > alpha_max if decisions is None else decisions.clamped
+    alpha = torch.where(clamped, torch.full_like(raw, alpha_max), raw)
+    (left, right), (top, bottom) = p.span[order].unbind(-2)[0].T[..., None], p.span[order].unbind(-2)[1].T[..., None]
+    allowed = (xs > left) & (xs < right) & (ys > top) & (ys < bottom)
+    hit = (alpha.detach() >= alpha_min) & allowed
     if decisions is None:
         after = torch.cumsum(torch.log1p(-alpha.detach() * hit), 0).exp()
-        keep = hit & (after > c.T_MIN)
+        keep = hit & (after > t_min)
     else:
         keep = decisions.keep
     alpha = torch.where(keep, alpha, torch.zeros_like(alpha))
@@ -146,10 +174,10 @@ def blend(
 
     margin = torch.full_like(xs[0], torch.inf)
     if decisions is None and len(order):
-        reached = before.detach() > c.T_MIN
+        reached = (before.detach() > t_min) & allowed
         free = raw.detach()
-        near = torch.minimum((free / c.ALPHA_MIN - 1).abs(), (free / c.ALPHA_MAX - 1).abs())
-        near = torch.minimum(near, torch.where(hit, (after / c.T_MIN - 1).abs(), torch.full_like(after, torch.inf)))
+        near = torch.minimum((free / alpha_min - 1).abs(), (free / alpha_max - 1).abs())
+        near = torch.minimum(near, torch.where(hit, (after / t_min - 1).abs(), torch.full_like(after, torch.inf)))
         margin = torch.where(reached, near, torch.full_like(near, torch.inf)).amin(0)
     shape = (settings.height, settings.width)
     taken = Decisions(order, keep, clamped)
@@ -158,8 +186,8 @@ def blend(
 
 def rasterization(
     means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
+    quats: Tensor | None,  # [N, 4]
+    scales: Tensor | None,  # [N, 3]
     opacities: Tensor,  # [N]
     colors: Tensor,  # [N, D] or [N, K, D]
     viewmats: Tensor,  # [C, 4, 4]
@@ -171,9 +199,13 @@ def rasterization(
     radius_clip: float = 0.0,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
+    *,
     backgrounds: Tensor | None = None,  # [C, D]
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
+    covars: Tensor | None = None,  # [N, 3, 3]
+    semantics: str = "gsplat",
+    options: Options | None = None,
     order: Tensor | None = None,
     decisions: list[Decisions] | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -181,7 +213,8 @@ def rasterization(
 
     Args:
         means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d,
-            sh_degree, backgrounds, render_mode, rasterize_mode: as in `drjit_splat.rasterization`.
+            sh_degree, backgrounds, render_mode, rasterize_mode, covars, semantics, options: as in
+            `drjit_splat.rasterization`.
         order: [C, N] splat ids near to far; by default the float64 depths decide.
         decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
 
@@ -194,12 +227,24 @@ def rasterization(
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
     """
     settings = Settings(
-        width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, render_mode, rasterize_mode
+        width,
+        height,
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        sh_degree,
+        render_mode,
+        rasterize_mode,
+        semantics,
+        options or Options(),
     )
-    given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
+    if covars is not None:
+        quats = scales = None
+    given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     check_shapes(given, settings)
-    check_finite(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
-    splats = Splats(*(None if t is None else t.to(torch.float64) for t in vars(given).values()))  # type: ignore[arg-type]
+    check_finite(**{name: tensor for name, tensor in vars(given).items() if tensor is not None})
+    splats = given.to(torch.float64)
 
     images, coverages, metas = [], [], []
     for i in range(len(viewmats)):
@@ -207,9 +252,9 @@ def rasterization(
         projection = project(splats, viewmat, K, settings)
         parts = []
         if settings.has_colors and sh_degree is None:
-            parts.append(splats.colors)
+            parts.append(splats.colors_of(i, settings))
         elif settings.has_colors:
-            parts.append(colors_seen_from(splats.colors, splats.means, viewmat, int(sh_degree or 0)))
+            parts.append(colors_seen_from(splats.colors_of(i, settings), splats.means, viewmat, int(sh_degree or 0)))
         if settings.has_depth:
             parts.append(projection.depths[:, None])
         sums, coverage, taken, margin = blend(

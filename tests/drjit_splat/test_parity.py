@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not FILE.exists(), reason="skipped: no recorded 
 @pytest.mark.parametrize("camera", ["centred", "offcentre"])
 def test_recorded_images(camera: str) -> None:
     data = load_file(FILE)
-    color, alpha, _ = rasterization(
+    color, alpha, meta = rasterization(
         data["in/means"],
         data["in/rotations"],
         data["in/scales"],
@@ -28,15 +28,16 @@ def test_recorded_images(camera: str) -> None:
         data[f"in/K_{camera}"][None, :3, :3],
         width=88,
         height=72,
-        near_plane=0.2,
+        semantics="inria",
         backgrounds=data["in/bg"][None],
         render_mode="RGB+D",
     )
     wanted = torch.cat([data[f"out/{camera}_{kind}"] for kind in ("rgb", "depth", "alpha")])
     error = (torch.cat([color[0], alpha[0]], -1).permute(2, 0, 1) - wanted).abs()
-    # The recording cuts splats at a square of three standard deviations, clamps opacities at 0.99 instead of 0.999 and
-    # centres the Jacobian's clamp on the image instead of on the optical axis, so single pixels differ.
-    assert float(error[:3].max()) < 0.015
-    assert float(error.max()) < 0.06
-    assert float(error.mean()) < 1e-4
+    # A threshold may fall the other way in float32 at single pixels.
+    assert float((error.amax(0) > 2e-5).double().mean()) < 2e-3
+    assert float(error.max()) < 0.01
     assert float(wanted[4].mean()) > 0.05
+    visible = meta["visible"][0]  # the recording also gives radii to splats too faint for any pixel
+    assert int(visible.sum()) > 200
+    assert torch.equal(meta["radii"][0, visible, 0].long(), data[f"out/{camera}_radii"][visible])

@@ -1,0 +1,176 @@
+"""Splat `.ply` files, the format that 3DGS viewers share."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ._inputs import check_finite
+
+_C0 = 0.28209479177387814
+_HEADER_LIMIT = 1 << 16
+_REST = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest properties -> harmonic degree
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+_NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)))
+_QUAT = tuple(f"rot_{i}" for i in range(4))
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """Activated splats, as `rasterization` takes them with `sh_degree=degree`; float32."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4] wxyz
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    harmonics: Tensor  # [N, (degree + 1)^2, 3]
+
+    @property
+    def degree(self) -> int:
+        """Degree of the harmonics, 0 to 3."""
+        return math.isqrt(self.harmonics.shape[1]) - 1
+
+    @property
+    def colors(self) -> Tensor:
+        """[N, 3] colours without their view-dependent part: 0.5 + C0 * harmonics[:, 0]."""
+        return 0.5 + _C0 * self.harmonics[:, 0]
+
+
+def _read_header(path: Path) -> tuple[int, list[tuple[str, str]], int]:
+    """Vertex count, (name, numpy type) of every property, and the header's length in bytes."""
+    with path.open("rb") as file:
+        start = file.read(_HEADER_LIMIT)
+    end = start.find(b"end_header\n")
+    if not start.startswith(b"ply") or end < 0:
+        raise ValueError(f"{path} is not a .ply file (no header that starts with 'ply' and ends with 'end_header')")
+    lines = [line.split() for line in start[:end].decode("ascii", "replace").splitlines()]
+    if ["format", "binary_little_endian", "1.0"] not in lines:
+        raise ValueError(f"{path} is not binary_little_endian; write it in that format")
+    elements = [line for line in lines if line[:1] == ["element"]]
+    if len(elements) != 1 or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
+        raise ValueError(f"{path} must hold one 'element vertex <count>' and nothing else")
+    properties = []
+    for line in lines:
+        if line[:1] == ["property"]:
+            if len(line) != 3 or line[1] not in _TYPES:
+                raise ValueError(f"{path} has a property that cannot be read: {' '.join(line)!r}")
+            properties.append((line[2], _TYPES[line[1]]))
+    if len({name for name, _ in properties}) != len(properties):
+        raise ValueError(f"{path} names a property twice")
+    return int(elements[0][-1]), properties, end + len(b"end_header\n")
+
+
+def load_ply(path: str | os.PathLike[str]) -> SplatFile:
+    """Read a splat file with harmonics of degree 0 to 3; further properties are ignored.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no splat file, is cut short, or holds a NaN or an infinity.
+    """
+    path = Path(path)
+    count, properties, offset = _read_header(path)
+    names = [name for name, _ in properties]
+    missing = [name for name in (*_NEEDED, *_QUAT) if name not in names]
+    if missing:
+        raise ValueError(f"{path} has no property {missing[0]!r}; is it a splat file?")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in _REST or any(f"f_rest_{i}" not in names for i in range(rest)):
+        raise ValueError(f"{path} has {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
+    layout = np.dtype(properties)
+    expected, size = offset + count * layout.itemsize, path.stat().st_size
+    if size < expected:
+        raise ValueError(f"{path} is cut short: {count} splats need {expected} bytes, the file has {size}")
+    table = np.fromfile(path, layout, count, offset=offset)
+
+    def columns(*chosen: str) -> Tensor:
+        return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in chosen], -1))
+
+    means = columns("x", "y", "z")
+    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    if rest:
+        # The file keeps all coefficients of red, then of green, then of blue.
+        higher = columns(*(f"f_rest_{i}" for i in range(rest))).view(count, 3, rest // 3)
+        harmonics = torch.cat([harmonics, higher.transpose(1, 2)], 1)
+    found = SplatFile(
+        means,
+        columns(*_QUAT),
+        columns("scale_0", "scale_1", "scale_2").exp(),
+        columns("opacity")[:, 0].sigmoid(),
+        harmonics.contiguous(),
+    )
+    try:
+        check_finite(**vars(found))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return found
+
+
+def save_ply(
+    path: str | os.PathLike[str],
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, 3] or [N, K, 3]
+) -> None:
+    """Write a splat file that 3DGS viewers read.
+
+    Args:
+        path: file to write.
+        means: [N, 3] centres.
+        quats: [N, 4] rotations, wxyz.
+        scales: [N, 3] standard deviations (stored as logarithms; zeros become 1e-12).
+        opacities: [N] in [0, 1] (stored as logits, held 1e-6 away from 0 and 1).
+        colors: [N, 3] colours, or [N, K, 3] harmonics with K 1, 4, 9 or 16.
+
+    Raises:
+        ValueError: a tensor has a wrong shape or holds a NaN or an infinity.
+    """
+    n = len(means)
+    harmonics = ((colors - 0.5) / _C0)[:, None] if colors.ndim == 2 else colors
+    shapes = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "colors": (harmonics, (n, harmonics.shape[1], 3)),
+    }
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have the shape {list(shape)}, not {list(tensor.shape)}")
+    if harmonics.shape[1] not in (1, 4, 9, 16):
+        raise ValueError(f"colors must have 1, 4, 9 or 16 harmonics a channel, not {harmonics.shape[1]}")
+    check_finite(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    rest = 3 * (harmonics.shape[1] - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(rest)] + ["opacity", "scale_0", "scale_1", "scale_2", *_QUAT]
+    parts = [
+        means,
+        torch.zeros_like(means),
+        harmonics[:, 0],
+        harmonics[:, 1:].transpose(1, 2).reshape(n, rest),
+        torch.logit(opacities.double(), eps=1e-6)[:, None],
+        scales.double().clamp_min(1e-12).log(),
+        quats,
+    ]
+    table = torch.cat([part.detach().cpu().to(torch.float32) for part in parts], 1).numpy()
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    with Path(path).open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
