@@ -66,7 +66,11 @@ class Train:
             raise UikaError("overfit and workers must not be negative, people at least 1")
         names = ("steps", "learning_rate", "images", "size", "save_every")
         given: dict[str, Any] = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        config = replace(TRAINING[self.preset], part=self.part, seed=self.seed, **given)
+        config = replace(TRAINING[self.preset], part=self.part, seed=self.seed)
+        if self.part == "estimator":
+            # Maps are much cheaper than pictures of Gaussians; the released training has the same proportions.
+            config = replace(config, images=3 * config.images, items=2 * config.items)
+        config = replace(config, **given)
         if self.overfit:
             # The same pictures at every step and full speed soon: this is to show that gradients arrive.
             config = replace(

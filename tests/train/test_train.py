@@ -143,3 +143,12 @@ def test_a_training_config_names_what_cannot_work():
         replace(CONFIG, size=50)
     with pytest.raises(UikaError, match="preset"):
         replace(CONFIG, preset="huge")
+
+
+def test_the_command_refuses_before_it_works(tmp_path, capsys):
+    from uika.cli import main
+
+    assert main(["train", "-o", str(tmp_path / "run"), "--data", str(tmp_path / "none")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    assert main(["train", "-o", str(tmp_path / "run"), "--data", "synthetic", "x"]) == 2
+    assert "not both" in capsys.readouterr().err
