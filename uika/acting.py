@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from uika.exchange.read import KINDS, read_motion
 from uika.head import HeadModel
-from uika.motion import Motion, MotionError, load_motion
+from uika.motion import Motion, MotionError
 
 Actions = Mapping[str, float]  # ARKit action -> activation; a name without side stands for both sides
 
@@ -112,13 +114,14 @@ def expressions(head: HeadModel, fps: float = 25.0) -> Motion:
 MOTIONS: dict[str, Callable[[HeadModel, float], Motion]] = {"orbit": orbit, "talk": talk, "expressions": expressions}
 
 
-def get_motion(name: str, head: HeadModel, fps: float | None = None) -> Motion:
+def get_motion(name: str, head: HeadModel, fps: float | None = None, source: HeadModel | None = None) -> Motion:
     """A built-in motion by name, or the motion file at that path.
 
     Args:
-        name: "orbit", "talk", "expressions", or the path of a file for `load_motion`.
+        name: "orbit", "talk", "expressions", or the path of a motion for `uika.exchange.read_motion`.
         head: the head model to move.
         fps: frames per second; None means 25 for the built-in motions and the file's own rate.
+        source: the FLAME head that FLAME parameters belong to, if `head` is none.
 
     Raises:
         MotionError: there is no such motion or file, the file cannot be used, or `fps` is out of range.
@@ -127,9 +130,10 @@ def get_motion(name: str, head: HeadModel, fps: float | None = None) -> Motion:
         raise MotionError(f"fps must lie between 1 and 240, not {fps:g}")
     if name in MOTIONS:
         return MOTIONS[name](head, 25.0 if fps is None else fps)
-    if not name.endswith(".npz"):
-        raise MotionError(f"{name}: is neither a built-in motion ({', '.join(MOTIONS)}) nor a motion file (.npz)")
-    motion = load_motion(name, head)
+    if Path(name).suffix.lower() not in KINDS and not Path(name).is_dir():
+        kinds = ", ".join(KINDS)
+        raise MotionError(f"{name}: is neither a built-in motion ({', '.join(MOTIONS)}) nor a motion file ({kinds})")
+    motion = read_motion(name, head, source)
     return motion if fps is None else motion.resampled(fps)
 
 

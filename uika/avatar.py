@@ -6,13 +6,22 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from uika.errors import UikaError
 from uika.files import replacing
-from uika.head import HeadModel, HeadParameters, pose_gaussians, pose_vertices, shaped_vertices
+from uika.head import (
+    Binding,
+    HeadModel,
+    HeadParameters,
+    pose_gaussians,
+    pose_vertices,
+    shaped_vertices,
+    skin_points,
+)
 
 FORMAT = "uika-avatar"
 VERSION = "1"
@@ -138,7 +147,11 @@ class Avatar:
         return shaped_vertices(head, neutral, self.static_offset)
 
     def pose(
-        self, params: HeadParameters, head: HeadModel, canonical: Tensor | None = None
+        self,
+        params: HeadParameters,
+        head: HeadModel,
+        canonical: Tensor | None = None,
+        skinning: Literal["surface", "released"] = "surface",
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Move the Gaussians with the head.
 
@@ -146,6 +159,8 @@ class Avatar:
             params: expression and pose, batch [...]; the identity in it is ignored, the avatar keeps its own.
             head: the head model that the avatar was made for.
             canonical: [V,3] the result of `canonical_vertices`, to save time over many frames.
+            skinning: "surface" turns and scales each Gaussian with the surface it lies on; "released" skins centres
+                only and keeps rotations and scales, as the authors' released model does.
 
         Returns:
             Means [...,M,3], quats [...,M,4] and scales [...,M,3].
@@ -153,6 +168,11 @@ class Avatar:
         Raises:
             AvatarError: the head model is another one.
         """
+        if skinning == "released":
+            own = params.replace(identity=self.identity)
+            means = skin_points(self.means, head, own, Binding(0, self.triangle, self.triangle, self.barycentric))
+            lead = means.shape[:-2]
+            return means, self.quats.expand(*lead, -1, -1), self.scales.expand(*lead, -1, -1)
         rest = self.canonical_vertices(head) if canonical is None else canonical
         posed = pose_vertices(head, params.replace(identity=self.identity), self.static_offset)
         return pose_gaussians(

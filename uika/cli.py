@@ -10,10 +10,15 @@ from typing import Any
 
 # Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# numpy is used for many small products only, which its threads would slow down.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from uika.errors import UikaError, install_command
 
-_ABOUT = "Photos in, an animatable 3D Gaussian head out. Add --debug to any command to see the traceback of an error."
+_ABOUT = (
+    "Photos in, an animatable 3D Gaussian head out. Add --head FILE to any command to use another head model (see "
+    "`uika head import`), and --debug to see the traceback of an error."
+)
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
 
 
@@ -30,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     try:
-        return _parse([argument for argument in arguments if argument != "--debug"]).run()
+        arguments = _choose_head([argument for argument in arguments if argument != "--debug"])
+        return _parse(arguments).run()
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
@@ -43,6 +49,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = "" if code == _WRONG_INPUT or debug else " (--debug shows where)"
         print(f"uika: {sentence}{hint}", file=sys.stderr)
         return code
+
+
+def _choose_head(arguments: list[str]) -> list[str]:
+    """Take `--head FILE` out of the arguments and make that head model the one that is loaded."""
+    if "--head" not in arguments:
+        return arguments
+    at = arguments.index("--head")
+    if at + 1 == len(arguments):
+        raise UikaError("--head needs the head file to use, for example: --head flame.npz")
+    os.environ["UIKA_HEAD"] = arguments[at + 1]
+    return arguments[:at] + arguments[at + 2 :]
 
 
 def _parse(arguments: list[str]) -> Any:

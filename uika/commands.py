@@ -11,10 +11,13 @@ from tyro.conf import Positional, arg
 
 from uika.errors import UikaError
 from uika.files import check_folder, check_output
+from uika.motion_commands import Head, Track
 from uika.synthesize_command import Synthesize
 from uika.train_command import Train
 
 if TYPE_CHECKING:
+    from uika.head import HeadModel
+    from uika.motion import Motion
     from uika.reconstruction import Report
 
 PORTRAIT = Path(__file__).resolve().parent / "assets" / "portrait.jpg"
@@ -33,6 +36,8 @@ class Reconstruct:
     """The avatar file to write."""
     model: str = "tiny"
     """tiny, none, or a trained model file."""
+    refine: bool = False
+    """Refine face shape and poses with the colours that two or more photos share."""
 
     def run(self) -> int:
         """Reconstruct and save."""
@@ -40,9 +45,11 @@ class Reconstruct:
         _check_photos(self.photos)
         from uika.reconstruction import reconstruct
 
-        result = reconstruct(self.photos, model=self.model)
+        result = reconstruct(self.photos, model=self.model, refine=self.refine)
         result.avatar.save(target)
         _print_seconds(result.report)
+        if self.refine:
+            print(f"refined: {result.fit.gain or 'needs two or more photos'}")
         print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
         return 0
 
@@ -57,7 +64,11 @@ class Animate:
     avatar: Positional[Path]
     """The avatar file."""
     motion: str = "talk"
-    """orbit, talk, expressions, or a motion file (.npz)."""
+    """orbit, talk, expressions, or a motion: .npz, ARKit .csv or .json, FLAME parameters (file or folder)."""
+    video: Path | None = None
+    """A video to be driven by, instead of a motion."""
+    motion_head: Path | None = None
+    """The FLAME head that FLAME parameters belong to, for an avatar of another head model."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
     """The video to write."""
     size: int = 512
@@ -77,12 +88,24 @@ class Animate:
         check_view(0.0, 0.0, check_even(self.size))
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
-        motion = get_motion(self.motion, head, self.fps)
+        if self.video is None:
+            source = None if self.motion_head is None else load_head(self.motion_head)
+            motion = get_motion(self.motion, head, self.fps, source)
         check_renderer()
+        if self.video is not None:
+            motion = self._tracked(self.video, head)
         pictures = frames(avatar, motion, head=head, size=self.size, progress=True)
         count = write_video(target, (picture.rgb for picture in pictures), motion.fps)
         print(f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second")
         return 0
+
+    def _tracked(self, video: Path, head: HeadModel) -> Motion:
+        from uika.motion_commands import describe
+        from uika.tracking import track_video
+
+        found = track_video(video, head, progress=True)
+        print(f"tracked {video}: {describe(found)}")
+        return found.motion if self.fps is None else found.motion.resampled(self.fps)
 
 
 @dataclass(frozen=True)
@@ -229,7 +252,7 @@ class Bench:
         return main(["--preset", self.preset, "--views", *counts, "-o", str(check_folder(self.output))])
 
 
-Command = Reconstruct | Animate | Render | Demo | Train | Synthesize | Weights | Bench | Doctor
+Command = Reconstruct | Animate | Track | Render | Demo | Head | Train | Synthesize | Weights | Bench | Doctor
 
 
 def _check_photos(photos: tuple[Path, ...]) -> None:

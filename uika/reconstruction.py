@@ -57,6 +57,7 @@ def reconstruct(
     head: HeadModel | None = None,
     model: str | Path = "tiny",
     *,
+    refine: bool = False,
     report: Report | None = None,
 ) -> Reconstruction:
     """Make an avatar from photos of one person.
@@ -68,6 +69,7 @@ def reconstruct(
         head: the head model; None loads the one that `uika.head.load_head` finds.
         model: "tiny", the built-in network, which without training keeps the photos' colours on the fitted surface;
             "none", the same without running a network; or the path of a trained model (.safetensors).
+        refine: whether to refine the fit with the colours that two or more photos share.
         report: filled while the stages pass; None makes a new one.
 
     Raises:
@@ -89,7 +91,8 @@ def reconstruct(
         prepared = sorted((prepare(path) for path in photos), key=lambda photo: photo.sha256)
         hair = [head_matte(photo) for photo in prepared]
     with report.stage("fit"):
-        fit = fit_photos(prepared, head, hair)
+        pictures = [photo.image for photo in prepared] if refine else None
+        fit = fit_photos(prepared, head, hair, images=pictures)
     with report.stage("correspondence"):
         images = torch.stack([photo.image for photo in prepared])
         mattes = torch.stack([photo.matte for photo in prepared])

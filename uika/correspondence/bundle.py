@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from uika.correspondence.appearance import (
     CORRELATED,
     EXPRESSION_PRIOR,
+    LIGHT_PRIOR,
     NOISE,
     ROBUST_SCALE,
     Appearance,
@@ -56,6 +57,7 @@ def bundle(
     views: Mapping[int, View],
     targets: Mapping[int, Array],
     pull: float,
+    focal_spread: float = FOCAL_SPREAD,
 ) -> Bundle:
     """Refine what the frames of one person share, together with their poses.
 
@@ -67,6 +69,7 @@ def bundle(
         views: each frame's picture.
         targets: each frame's landmarks [478,2], pixels relative to the principal point.
         pull: weight of the landmarks on each frame's pose.
+        focal_spread: expected error of the logarithm of the focal length; tiny to keep it.
     """
     frames = sorted(poses)
     P = len(model.free) + 3 * len(model.joints) + 6
@@ -75,10 +78,10 @@ def bundle(
     anchors = {k: tuple(pull * part for part in landmark_pull(model, poses[k], targets[k])) for k in frames}
     travelled = {k: np.zeros(P) for k in frames}
     rows = _rows(person.model, modes, state, views, frames)
-    cost = first = _cost(rows, state, travelled, anchors, model.focal)
+    cost = first = _cost(rows, state, travelled, anchors, model.focal, focal_spread)
     damping = _DAMPING
     for _ in range(STEPS):
-        shared, steps = _step(rows, state, travelled, anchors, model, damping)
+        shared, steps = _step(rows, state, travelled, anchors, model, damping, focal_spread)
         trial = Bundle(
             state.offset + shared[:-1],
             state.focal * math.exp(float(np.clip(shared[-1], -0.3, 0.3))),
@@ -87,7 +90,7 @@ def bundle(
         )
         far = {k: travelled[k] + steps[k] for k in frames}
         trial_rows = _rows(person.model, modes, trial, views, frames)
-        trial_cost = _cost(trial_rows, trial, far, anchors, model.focal)
+        trial_cost = _cost(trial_rows, trial, far, anchors, model.focal, focal_spread)
         if trial_cost < cost:
             state, rows, travelled, cost, damping = trial, trial_rows, far, trial_cost, damping / 5
         else:
@@ -105,19 +108,19 @@ def _modes(head: HeadModel, model: FrameModel) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class _Rows:
-    level: Array  # [N,M] grey levels, light taken out
     weight: Array  # [N,M]
     robust: Array  # [N,M]
     shared: list[NDArray[np.float32]]  # N x [M,MODES+1]
     own: list[NDArray[np.float32]]  # N x [M,P]
-    residual: Array  # [N,M] against the best common level
+    residual: Array  # [N,M] grey levels, light taken out, against the best common level
 
 
 def _rows(
     model: FrameModel, modes: NDArray[np.float32], state: Bundle, views: Mapping[int, View], frames: Sequence[int]
 ) -> _Rows:
-    current = replace(shifted(model, (modes @ state.offset.astype(np.float32)).T), focal=state.focal)
-    levels, weights, shared, own = [], [], [], []
+    offset = np.asarray(modes @ state.offset, dtype=np.float64).T
+    current = replace(shifted(model, offset), focal=state.focal)
+    levels, weights, shared, own, facing = [], [], [], [], []
     for k in frames:
         pose, view = state.poses[k], views[k]
         place, camera = place_points(current, pose, view)
@@ -136,13 +139,26 @@ def _rows(
         weights.append(point_trust(current, pose, camera) / (CORRELATED * NOISE**2))
         shared.append(common)
         own.append(mine)
+        facing.append(np.concatenate((np.ones((len(camera), 1)), model.normal @ pose.rotation.T), -1))
     level, weight = np.stack(levels), np.stack(weights)
     weight *= (weight > 0).sum(0) >= MIN_VIEWS
-    middle = _common(level, weight)
+    gain, middle = np.ones_like(level), _common(level, weight)
     for _ in range(3):
-        robust = ROBUST_SCALE**2 / (ROBUST_SCALE**2 + (level - middle) ** 2)
-        middle = _common(level, weight * robust**2)
-    return _Rows(level, weight, robust, shared, own, level - middle)
+        robust = ROBUST_SCALE**2 / (ROBUST_SCALE**2 + (level / gain - middle) ** 2)
+        gain = _light(level, middle[0], weight * robust**2, np.stack(facing))
+        middle = _common(level / gain, weight * robust**2)
+    inverse = (1 / gain).astype(np.float32)[..., None]
+    shared = [rows * factor for rows, factor in zip(shared, inverse, strict=True)]
+    own = [rows * factor for rows, factor in zip(own, inverse, strict=True)]
+    return _Rows(weight, robust, shared, own, level / gain - middle)
+
+
+def _light(level: Array, middle: Array, weight: Array, facing: Array) -> Array:
+    """Gain [N,M] of each frame over the common level: smooth in the surface's direction [N,M,4]."""
+    lit = facing * middle[:, None]
+    matrix = (lit * weight[..., None]).transpose(0, 2, 1) @ lit + np.diag(LIGHT_PRIOR)
+    right = ((lit * (weight * level)[..., None]).sum(1) + np.array(LIGHT_PRIOR) * (1.0, 0.0, 0.0, 0.0))[..., None]
+    return np.asarray((facing @ np.linalg.solve(matrix, right))[..., 0].clip(0.2, 5.0))
 
 
 def _common(level: Array, weight: Array) -> Array:
@@ -150,11 +166,16 @@ def _common(level: Array, weight: Array) -> Array:
 
 
 def _cost(
-    rows: _Rows, state: Bundle, travelled: Mapping[int, Array], anchors: Mapping[int, tuple[Array, ...]], start: float
+    rows: _Rows,
+    state: Bundle,
+    travelled: Mapping[int, Array],
+    anchors: Mapping[int, tuple[Array, ...]],
+    start: float,
+    focal_spread: float,
 ) -> float:
     square = rows.residual**2
     cost = float((rows.weight * square * ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)).sum())
-    cost += IDENTITY_PULL * float(state.offset @ state.offset) + (math.log(state.focal / start) / FOCAL_SPREAD) ** 2
+    cost += IDENTITY_PULL * float(state.offset @ state.offset) + (math.log(state.focal / start) / focal_spread) ** 2
     for k, pose in state.poses.items():
         far, (matrix, gradient) = travelled[k], anchors[k]
         cost += EXPRESSION_PRIOR * float(pose.expression @ pose.expression)
@@ -169,6 +190,7 @@ def _step(
     anchors: Mapping[int, tuple[Array, ...]],
     model: FrameModel,
     damping: float,
+    focal_spread: float,
 ) -> tuple[Array, dict[int, Array]]:
     """One Gauss-Newton step of the shared [MODES+1] and of each frame's variables [P]."""
     frames = sorted(state.poses)
@@ -200,8 +222,8 @@ def _step(
     identity = np.arange(K - 1)
     matrix[identity, identity] += IDENTITY_PULL
     gradient[: K - 1] += IDENTITY_PULL * state.offset
-    matrix[K - 1, K - 1] += FOCAL_SPREAD**-2
-    gradient[K - 1] += math.log(state.focal / model.focal) / FOCAL_SPREAD**2
+    matrix[K - 1, K - 1] += focal_spread**-2
+    gradient[K - 1] += math.log(state.focal / model.focal) / focal_spread**2
     index = np.arange(size)
     matrix[index, index] += damping * np.abs(np.diagonal(matrix)) + 1e-6
     free = np.ones(size, dtype=bool)

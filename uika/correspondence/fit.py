@@ -11,6 +11,7 @@ from torch import Tensor
 
 from uika.correspondence.hair import fit_hair
 from uika.correspondence.landmarks import fit_landmarks
+from uika.correspondence.refine import Gain, refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters
 
 
@@ -32,22 +33,30 @@ class Fit:
 
     parameters: [N] head parameters with one identity; the cameras carry the head's pose.
     cameras: [N] cameras at the crops' size. static_offset [V,3] metres, the hair's displacement of the neutral head.
-    error [N]: mean landmark distance in outer eye-corner distances.
+    error [N]: mean landmark distance in outer eye-corner distances. gain: of the refinement by colours, if it ran.
     """
 
     parameters: HeadParameters
     cameras: Camera
     static_offset: Tensor
     error: Tensor
+    gain: Gain | None = None
 
 
-def fit_photos(photos: Sequence[FittablePhoto], head: HeadModel, head_mattes: Sequence[Tensor] | None = None) -> Fit:
+def fit_photos(
+    photos: Sequence[FittablePhoto],
+    head: HeadModel,
+    head_mattes: Sequence[Tensor] | None = None,
+    *,
+    images: Sequence[Tensor] | None = None,
+) -> Fit:
     """Fit one identity to all photos and expression, camera and hair to each (float32).
 
     Args:
         photos: prepared photos of one person, all cropped to the same size.
         head: the head model.
         head_mattes: [S,S] per photo, head and hair without shoulders; None fits no hair.
+        images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours they share; None does not.
 
     Raises:
         ValueError: there is no photo, or the photos have different sizes.
@@ -58,7 +67,10 @@ def fit_photos(photos: Sequence[FittablePhoto], head: HeadModel, head_mattes: Se
     if len(sizes) > 1:
         raise ValueError(f"photos: all crops must have one size, got {sorted(sizes)}")
     height, width = sizes.pop()
-    found = fit_landmarks(torch.stack([photo.landmarks for photo in photos]), head, width)
+    landmarks = torch.stack([photo.landmarks for photo in photos])
+    found, gain = fit_landmarks(landmarks, head, width), None
+    if images is not None:
+        found, gain = refine_landmark_fit(found, images, landmarks, head)
     N = len(photos)
     viewmat = torch.eye(4).repeat(N, 1, 1)
     viewmat[:, :3, :3], viewmat[:, :3, 3] = found.rotation.float(), found.translation.float()
@@ -72,4 +84,4 @@ def fit_photos(photos: Sequence[FittablePhoto], head: HeadModel, head_mattes: Se
     offset = torch.zeros_like(head.template)
     if head_mattes is not None:
         offset = fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
-    return Fit(parameters, cameras, offset, found.error.float())
+    return Fit(parameters, cameras, offset, found.error.float(), gain)

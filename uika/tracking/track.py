@@ -138,7 +138,7 @@ def _look(path: Path, progress: bool) -> _Seen:
         landmarks.append(marks)
         if marks is not None and index % stride == 0:
             keys[index] = face_view(greys[0], marks, np.array(size) / 2, BLURS[-1][0])
-        if len(keys) >= 2 * KEY_FRAMES:
+        if len(keys) >= 2 * KEY_FRAMES - 8:
             stride *= 2
             keys = {index: view for index, view in keys.items() if index % stride == 0}
     if not landmarks:
