@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from uika.model import FeatureCache, ModelConfig, Reconstructor, Session, build
+from uika.model import FeatureCache, ModelConfig, Reconstructor, Session, build, compile_blocks
 from uika.model.features import covered_tokens, occupied
 from uika.model.precision import computes_bfloat16
 
@@ -180,3 +180,12 @@ def test_rows_in_parts_give_the_same(model: Reconstructor, make_inputs: Make, mo
     whole = run(model, inputs)
     monkeypatch.setattr("uika.model.mm_block._ROWS", 5)
     assert worst(whole, run(model, inputs)) < 5e-6
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # what the compiler of torch warns of is its own affair
+def test_compiled_blocks_give_the_same(model: Reconstructor, make_inputs: Make) -> None:
+    inputs = make_inputs(2)
+    plain = run(model, inputs)
+    compile_blocks(model.transformer.layers)
+    assert worst(plain, run(model, inputs)) < 1e-5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,6 +28,11 @@ class SurfaceTexels:
     mirror: Tensor | None = None
     regions: Tensor | None = None
     prior: Tensor | None = None
+
+    def rows(self, first: int, last: int) -> SurfaceTexels:
+        """The texels from `first` to before `last`; the maps stay whole."""
+        points, quats, scales = (value[:, first:last] for value in (self.points, self.quats, self.scales))
+        return replace(self, points=points, quats=quats, scales=scales)
 
 
 @dataclass(frozen=True)

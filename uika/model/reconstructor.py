@@ -18,6 +18,8 @@ from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
+_TEXELS = 8192  # at once without gradients: few enough to stay in the processor's cache, changes no value
+
 
 class GaussianDecoder(nn.Module):
     """Tokens and aggregate -> Gaussian attributes at the valid texels (paper eq. 8)."""
@@ -33,10 +35,16 @@ class GaussianDecoder(nn.Module):
     def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
         """Tokens of four depths, observed [B,4,S,S], texel [M]."""
         features = resize(self.dpt_decoder(tokens, observed), (self.map_size, self.map_size))
+        step = len(texel) if torch.is_grad_enabled() else _TEXELS
         # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
         with torch.autocast(features.device.type, enabled=False):
-            picked = _gather(features, texel).to(observed.dtype)
-            return self.gs_net(self.mlp_net(picked), _gather(observed, texel), surface)
+            parts = []
+            for first in range(0, max(len(texel), 1), step or 1):
+                rows = texel[first : first + step]
+                seen = _gather(observed, rows)
+                part = surface.rows(first, first + len(rows))
+                parts.append(self.gs_net(self.mlp_net(_gather(features, rows).to(seen.dtype)), seen, part))
+        return Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
 
 
 class Reconstructor(nn.Module):
@@ -257,4 +265,4 @@ class Reconstructor(nn.Module):
 
 def _gather(maps: Tensor, texel: Tensor) -> Tensor:
     """[B,C,S,S] at row-major texels [M] -> [B,M,C]."""
-    return maps.flatten(2)[:, :, texel].transpose(1, 2)
+    return maps.flatten(2).index_select(2, texel).transpose(1, 2)
