@@ -14,8 +14,10 @@ def highlight(normal: Any, view: Any, mean: Any, diffuse: Any, rough: Any) -> An
     import drjit as dr
 
     normal = dr.normalize(normal)
-    directness = dr.minimum(dr.norm(mean), 1.0)
-    toward = mean / dr.maximum(directness, 1e-4)
+    length = dr.norm(mean)
+    toward = mean / dr.maximum(length, 1e-4)
+    # An even sky has a mean direction of length 2/3.
+    directness = dr.clip(3 * length - 2, 0.0, 1.0)
     half = dr.normalize(toward + view)
     # A spread source shows a lobe as wide as itself.
     a = dr.clip(rough * rough + 0.35 * (1 - directness), 0.02, 1.0)
@@ -28,7 +30,9 @@ def highlight(normal: Any, view: Any, mean: Any, diffuse: Any, rough: Any) -> An
     k = a / 2
     masking = 1 / ((nl * (1 - k) + k) * (nv * (1 - k) + k))
     fresnel = _SPECULAR + (1 - _SPECULAR) * (1 - dr.maximum(dr.dot(half, view), 0.0)) ** 5
-    return diffuse * (directness * dr.pi * 0.25 * lobe * masking * fresnel)
+    # What comes from all around is reflected as from an even room (Schlick's term, weakened by roughness).
+    even = _SPECULAR + (dr.maximum(1 - rough, _SPECULAR) - _SPECULAR) * (1 - nv) ** 5
+    return diffuse * (directness * dr.pi * 0.25 * lobe * masking * fresnel + (1 - directness) * even)
 
 
 def pixel_pattern(spp: int) -> list[tuple[float, float]]:

@@ -69,7 +69,7 @@ def test_fast_views_agree_with_mitsubas_integrator(face: HeadModel) -> None:
     albedo, rough = paint(sample_person(3, face), face, 256)
     srgb = scenes.linear_to_srgb(albedo)
     texture = as_texture(albedo, rough)
-    for light, limit in (("studio", 0.05), ("environment", 0.05)):
+    for light, limit in (("studio", 0.06), ("environment", 0.04), ("side", 0.03)):
         stage = lit_stage(face, light)  # type: ignore[arg-type]
         seen = Shader(stage, face, face.template, texture).view(CAMERA, 4, ("uv", "depth", "normal", "triangle"))
         names = ("rgb", "mask", "uv", "depth", "triangle")
