@@ -213,7 +213,8 @@ def _plain(value: Any) -> Any:
 
 def _array(record: _Array) -> np.ndarray:
     _, shape, dtype, fortran, data = record.state
-    flat = np.frombuffer(_bytes(data), _dtype(dtype))
+    kind = _dtype(dtype)
+    flat = np.frombuffer(_bytes(data), kind)
     return flat.reshape(tuple(int(n) for n in shape), order="F" if fortran else "C").copy()
 
 
