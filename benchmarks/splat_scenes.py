@@ -1,12 +1,16 @@
-"""Synthetic scenes for timing: a head-sized shell of flat Gaussians seen by one camera."""
+"""Scenes for timing: a head-sized shell of flat Gaussians, the same with a heavy tail, and a reconstructed avatar."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
+
+PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
+NAMES = ("30k", "130k", "500k", "avatar", "heavy")
 
 
 @dataclass(frozen=True)
@@ -99,3 +103,33 @@ def head_scene(count: int, size: int, seed: int = 0) -> Scene:
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
     arrays = (means, quats, scales, opacities, colors, view[None], K[None])
     return Scene(*(a.to(torch.float32).contiguous() for a in arrays), size=size)
+
+
+def heavy_scene(count: int, size: int, seed: int = 0, share: float = 0.02, factor: float = 30.0) -> Scene:
+    """`head_scene` with a `share` of the splats `factor` times larger."""
+    scene = head_scene(count, size, seed)
+    chosen = torch.rand(count, generator=torch.Generator().manual_seed(seed + 1)) < share
+    return replace(scene, scales=torch.where(chosen[:, None], factor * scene.scales, scene.scales))
+
+
+def avatar_scene(size: int) -> Scene:
+    """The avatar of the bundled portrait in its own expression, seen from the front; takes a minute."""
+    from uika import load_head, neutral_camera, reconstruct
+    from uika.head import HeadParameters
+
+    head = load_head()
+    avatar = reconstruct([PORTRAIT], head).avatar
+    means, quats, scales = avatar.pose(HeadParameters.zeros(head), head)
+    camera = neutral_camera(avatar, size=size)
+    arrays = (means, quats, scales, avatar.opacities, avatar.colors, camera.viewmat[None], camera.K[None])
+    return Scene(*(a.to(torch.float32).contiguous() for a in arrays), size=size)
+
+
+def named_scene(name: str) -> Scene:
+    """One of `NAMES`: three sizes of the head, the avatar at 512 x 512, and the heavy tail of 130k @ 512 x 512."""
+    if name == "avatar":
+        return avatar_scene(512)
+    if name == "heavy":
+        return heavy_scene(130_000, 512)
+    count, size = {"30k": (30_000, 256), "130k": (130_000, 512), "500k": (500_000, 1024)}[name]
+    return head_scene(count, size)

@@ -49,10 +49,10 @@ def project(
 
 
 @torch.no_grad()
-def _tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, size: int) -> tuple[Tensor, Tensor]:
+def tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Splat ids tile by tile, near to far, and where each tile's begin [tiles + 1]."""
     across = -(-size // TILE)
-    order = torch.argsort(depths.contiguous().view(torch.int32), stable=True)
+    order = torch.argsort(depths.to(torch.float32).contiguous().view(torch.int32), stable=True)
     order = order[(radii[order] > 0).all(-1)]
     low = ((means2d[order] - radii[order]) / TILE).floor().long().clamp(0, across)
     high = ((means2d[order] + radii[order]) / TILE).ceil().long().clamp(0, across)
@@ -67,15 +67,16 @@ def _tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, size: int) -> tu
     return order[splat[permutation]], start
 
 
-def _alphas(means2d: Tensor, conics: Tensor, opacities: Tensor, splat: Tensor, pixel: Tensor, size: int) -> Tensor:
-    dx = (pixel % size).float() + 0.5 - means2d[splat, 0]
-    dy = torch.div(pixel, size, rounding_mode="floor").float() + 0.5 - means2d[splat, 1]
+def alphas(means2d: Tensor, conics: Tensor, opacities: Tensor, splat: Tensor, pixel: Tensor, size: int) -> Tensor:
+    """Opacity of every pair, held at the largest."""
+    dx = (pixel % size).to(means2d.dtype) + 0.5 - means2d[splat, 0]
+    dy = torch.div(pixel, size, rounding_mode="floor").to(means2d.dtype) + 0.5 - means2d[splat, 1]
     a, b, d = conics[splat].unbind(-1)
     sigma = 0.5 * (a * dx * dx + d * dy * dy) + b * dx * dy
     return (opacities[splat] * torch.exp(-sigma)).clamp_max(c.ALPHA_MAX)
 
 
-def _transmittances(alpha: Tensor, pixel: Tensor) -> Tensor:
+def transmittances(alpha: Tensor, pixel: Tensor) -> Tensor:
     """What each pair finds in front of it; a running product within each pixel.
 
     It is a difference of one long sum of logarithms, in float64 or it would drown.
@@ -85,14 +86,14 @@ def _transmittances(alpha: Tensor, pixel: Tensor) -> Tensor:
     first = torch.ones_like(pixel, dtype=torch.bool)
     first[1:] = pixel[1:] != pixel[:-1]
     begin = first.nonzero()[:, 0][first.cumsum(0) - 1]
-    return torch.exp(total - total[begin]).float()
+    return torch.exp(total - total[begin]).to(alpha.dtype)
 
 
 @torch.no_grad()
-def _pairs_that_count(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, ids: Tensor, start: Tensor, size: int
+def candidates(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, ids: Tensor, start: Tensor, size: int, least: float
 ) -> tuple[Tensor, Tensor]:
-    """(splat, pixel) of every blended pair, sorted by pixel and near to far within each."""
+    """(splat, pixel) of every pair of at least about `least`, sorted by pixel and near to far within each."""
     across = -(-size // TILE)
     lengths = start[1:] - start[:-1]
     tiles = torch.argsort(lengths, descending=True)
@@ -100,7 +101,7 @@ def _pairs_that_count(
     local = torch.arange(TILE * TILE)
     x, y = local % TILE + 0.5, torch.div(local, TILE, rounding_mode="floor") + 0.5
     # The exponent is quadratic in the pixel: one matrix product evaluates a whole tile.
-    powers = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    powers = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1).to(means2d.dtype)
     splats, pixels = [], []
     position = 0
     while position < len(tiles):
@@ -115,17 +116,24 @@ def _pairs_that_count(
         constant = torch.log(opacities[splat]) - 0.5 * (a * mx * mx + d * my * my) - b * mx * my
         constant[entry >= lengths[batch, None]] = -torch.inf
         quadratic = torch.stack([constant, a * mx + b * my, d * my + b * mx, -0.5 * a, -b, -0.5 * d], 1)
-        near = powers @ quadratic > math.log(c.ALPHA_MIN) - 1e-3  # [T, P, L]; the exact test follows
+        near = powers @ quadratic > math.log(least) - 1e-3  # [T, P, L]; the exact test follows
         tile, pixel, index = near.nonzero(as_tuple=True)
         column, row = corner_x[tile] + pixel % TILE, corner_y[tile] + torch.div(pixel, TILE, rounding_mode="floor")
         inside = (column < size) & (row < size)
         splats.append(splat[tile, index][inside])
         pixels.append((row * size + column)[inside])
-    splat, pixel = torch.cat(splats), torch.cat(pixels)
-    alpha = _alphas(means2d, conics, opacities, splat, pixel, size)
+    return torch.cat(splats), torch.cat(pixels)
+
+
+@torch.no_grad()
+def _pairs_that_count(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, ids: Tensor, start: Tensor, size: int
+) -> tuple[Tensor, Tensor]:
+    splat, pixel = candidates(means2d, conics, opacities, ids, start, size, c.ALPHA_MIN)
+    alpha = alphas(means2d, conics, opacities, splat, pixel, size)
     hit = alpha >= c.ALPHA_MIN
     splat, pixel, alpha = splat[hit], pixel[hit], alpha[hit]
-    keep = _transmittances(alpha, pixel) * (1 - alpha) > c.T_MIN
+    keep = transmittances(alpha, pixel) * (1 - alpha) > c.T_MIN
     return splat[keep], pixel[keep]
 
 
@@ -141,9 +149,9 @@ def render(
 ) -> Tensor:
     """Image [size, size, D] over black by the first camera; differentiable by autograd."""
     means2d, conics, depths, radii = project(means, quats, scales, viewmats[0], Ks[0], size)
-    ids, start = _tile_lists(means2d.detach(), radii, depths.detach(), size)
+    ids, start = tile_lists(means2d.detach(), radii, depths.detach(), size)
     splat, pixel = _pairs_that_count(means2d.detach(), conics.detach(), opacities.detach(), ids, start, size)
-    alpha = _alphas(means2d, conics, opacities, splat, pixel, size)
-    weight = alpha * _transmittances(alpha, pixel)
+    alpha = alphas(means2d, conics, opacities, splat, pixel, size)
+    weight = alpha * transmittances(alpha, pixel)
     image = torch.zeros(size * size, colors.shape[1])
     return image.index_add(0, pixel, weight[:, None] * colors[splat]).view(size, size, -1)

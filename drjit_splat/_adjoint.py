@@ -10,7 +10,8 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import Backend, packet, write
-from ._project import RECORD, Arrays, Camera, Shape, project, read_splats
+from ._ewa import Camera, Shape, project
+from ._project import RECORD, Arrays, read_splats
 from ._settings import Settings
 
 CAMERA = 16  # 12 entries of the view matrix, then fx, fy, cx, cy

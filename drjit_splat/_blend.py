@@ -74,7 +74,9 @@ def tile_of(be: Backend, index: Any, lists: TileLists, settings: Settings) -> Ti
 
 def offsets(be: Backend, tile: Tile, geometry: list[Any]) -> tuple[Any, Any]:
     """dx + h dy and dy from the splat's mean to the centre of the tile's first pixel."""
-    dx, dy = be.plain.Float(tile.x) + 0.5 - geometry[0], be.plain.Float(tile.y) + 0.5 - geometry[1]
+    J = be.plain
+    dx = dr.fma(-0.5, J.Float(tile.width), J.Float(tile.x) + 0.5) - geometry[0]
+    dy = dr.fma(-0.5, J.Float(tile.height), J.Float(tile.y) + 0.5) - geometry[1]
     return dr.fma(geometry[3], dy, dx), dy
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import drjit as dr
 
 from . import _adjoint, _lists, _project
-from ._backend import Backend, packet, power_of_two, write, write_packet
+from . import constants as c
+from ._backend import Backend, larger, packet, power_of_two, write, write_packet
 from ._blend import Blended, blend
 from ._blend_backward import blend_backward
 from ._project import RECORD, Arrays
@@ -95,7 +96,7 @@ def _records(
     values += [J.Float(0)] * (power_of_two(count) - count)
     kept = packet(be, p.records, 2 * i, 8)
     if opacities is not None:
-        kept[5] = dr.log2(_project.larger(opacities, _project.c.OPACITY_FLOOR))
+        kept[5] = dr.log2(larger(opacities, c.OPACITY_FLOOR))
     records = dr.empty(J.Float, n * RECORD)
     write_packet(be, records, kept, 2 * i)
     ratio = RECORD // len(values)

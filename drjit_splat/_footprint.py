@@ -14,7 +14,7 @@ from ._backend import TILE, Backend, larger, smaller
 from ._settings import Settings
 
 if TYPE_CHECKING:
-    from ._project import Camera, Ellipse
+    from ._ewa import Camera, Ellipse
 
 LOG2E = math.log2(math.e)
 

@@ -62,6 +62,8 @@ def describe(traces: list[Trace], n: int, device: torch.device) -> Meta:
         records: Tensor = p.records.torch().view(n, RECORD)
         return records
 
+    middle = torch.tensor([0.5 * settings.width, 0.5 * settings.height], device=device)
+
     def culled(trace: Trace) -> dict[str, int]:
         reasons = {reason: 0 for reason in CULLED if reason} if trace.projected is None else trace.projected.culled
         return reasons | trace.skipped()
@@ -72,7 +74,7 @@ def describe(traces: list[Trace], n: int, device: torch.device) -> Meta:
     real = torch.float32
     return Meta(
         {
-            "means2d": each((2,), real, lambda p: geometry(p)[:, :2]),
+            "means2d": each((2,), real, lambda p: geometry(p)[:, :2] + middle),
             "depths": each((), real, lambda p: p.depths.torch()),
             "conics": each((3,), real, lambda p: _conics(geometry(p))),
             "opacities": each((), real, lambda p: p.opacities.torch()),

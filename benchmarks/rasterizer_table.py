@@ -1,0 +1,139 @@
+"""Five scenes beside plain torch: `OMP_WAIT_POLICY=passive python -m benchmarks.rasterizer_table [--scenes 30k 130k]`.
+
+Forward, forward + backward, stages, pairs, the floor that this machine's arithmetic sets, and peak memory. The two
+implementations take turns in one process; peak memory is that of a process of its own with torch loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+
+import torch
+
+from benchmarks import torch_baseline
+from benchmarks.rasterizer_common import Timing, fastest_fma, interleaved, markdown, save
+from benchmarks.splat_scenes import NAMES, Scene, named_scene
+from drjit_splat import profile, rasterization
+
+# Floating point operations of one 4x4 tile and splat: 16 pixels (recurrence 2, clamps 3, transmittance 3, colours 6;
+# backward the same again without the image, and 26 more) and what a pair costs once (4 exponentials, moments).
+FORWARD_FLOP = 16 * 14 + 80
+BACKWARD_FLOP = 16 * (8 + 26) + 200
+BASELINE_TURNS = {"30k": 4, "130k": 3, "500k": 1, "avatar": 2, "heavy": 0}
+
+
+def functions(scene: Scene, baseline: bool) -> dict[str, Callable[[], object]]:
+    """Forward and forward + backward of both implementations."""
+    leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
+    weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
+
+    def forward() -> None:
+        with torch.no_grad():
+            rasterization(*scene.tensors, scene.size, scene.size)
+
+    def both() -> None:
+        image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size)[0][0]
+        torch.autograd.grad(image, leaves, grad_outputs=weight)
+
+    def torch_forward() -> None:
+        with torch.no_grad():
+            torch_baseline.render(*scene.tensors, scene.size)
+
+    def torch_both() -> None:
+        image = torch_baseline.render(*leaves, *scene.tensors[5:], scene.size)
+        torch.autograd.grad(image, leaves, grad_outputs=weight)
+
+    ours: dict[str, Callable[[], object]] = {"forward": forward, "both": both}
+    return ours | ({"torch forward": torch_forward, "torch both": torch_both} if baseline else {})
+
+
+def stages(both: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Least milliseconds of every stage of forward + backward."""
+    found: dict[str, float] = {}
+    for _ in range(repeats):
+        with profile() as report:
+            both()
+        for name, spent in report.stages.items():
+            found[name] = min(spent, found.get(name, spent))
+    return {name: round(spent, 2) for name, spent in found.items()}
+
+
+def peak_memory(name: str) -> float:
+    """MB of a process that renders and differentiates the scene a few times."""
+    if name == "avatar":
+        return float("nan")  # reconstructing the avatar needs more than rendering it
+    command = [sys.executable, "-m", "benchmarks.rasterizer_table", "--memory-of", name]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def print_memory(name: str) -> None:
+    run = functions(named_scene(name), baseline=False)["both"]
+    for _ in range(5):
+        run()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+def measure(name: str, repeats: int, peak: float) -> tuple[dict[str, object], dict[str, object]]:
+    """A row of the table and a row of the stages."""
+    scene = named_scene(name)
+    turns = BASELINE_TURNS[name]
+    run = functions(scene, turns > 0)
+    counts = {key: turns if key.startswith("torch") else repeats for key in run}
+    times: dict[str, Timing] = interleaved(run, counts)
+    with torch.no_grad():
+        meta = rasterization(*scene.tensors, scene.size, scene.size)[2]
+    pairs = meta["n_pairs"][0]
+    worked = pairs - meta["n_culled"][0]["occluded_pairs"]
+    floor = worked * FORWARD_FLOP / peak / 1e6
+    row: dict[str, object] = {
+        "scene": name,
+        "splats": len(scene.means),
+        "side": scene.size,
+        "forward": times["forward"],
+        "forward + backward": times["both"],
+        "torch": f"{times['torch forward'].best:.0f}" if turns else "-",
+        "torch f + b": f"{times['torch both'].best:.0f}" if turns else "-",
+        "ratio": f"{times['torch forward'].best / times['forward'].best:.0f}x" if turns else "-",
+        "ratio f + b": f"{times['torch both'].best / times['both'].best:.0f}x" if turns else "-",
+        "pairs": pairs,
+        "floor": f"{floor:.1f} / {floor + worked * BACKWARD_FLOP / peak / 1e6:.1f}",
+        "CPU ms": f"{times['forward'].cpu:.0f} / {times['both'].cpu:.0f}",
+        "peak MB": f"{peak_memory(name):.0f}",
+    }
+    return row, {"scene": name} | stages(run["both"], max(5, repeats // 2))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--memory-of", choices=NAMES, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.memory_of:
+        print_memory(arguments.memory_of)
+        return
+    peak = fastest_fma()
+    rows, stage_rows = [], []
+    for name in arguments.scenes:
+        row, stage_row = measure(name, arguments.repeats if name != "500k" else max(5, arguments.repeats // 2), peak)
+        rows.append(row)
+        stage_rows.append(stage_row)
+        print(row, flush=True)
+    projection = "gsplat 1.5.3's" if torch_baseline.has_gsplat() else "the oracle's (gsplat is not installed)"
+    text = (
+        "Milliseconds, minimum / median, through the torch API. The torch columns are vectorised torch with "
+        f"{projection} projection, minimum. Floor: operations of the pairs worked on / measured multiply-add rate.\n\n"
+        + markdown(rows)
+        + "\n\nStages of forward + backward, minimum:\n\n"
+        + markdown(stage_rows)
+    )
+    save("rasterizer_table", "Rasterizer: five scenes", text, {"scenes": rows, "stages": stage_rows})
+
+
+if __name__ == "__main__":
+    main()
