@@ -46,7 +46,9 @@ def generate_identity(
     offset = hair_offsets(person, head)
     params = perform(head, person.shape, frames, _random(seed, identity, "motion"))
     bare = shaped_vertices(head, HeadParameters.zeros(head).replace(identity=person.shape))
-    exposure = lighting.brightness / _face_radiance(stage, head, bare + offset)
+    # The same light samples for all frames: others would make the picture flicker.
+    samples = int(_random(seed, identity, "samples").integers(2**31))
+    exposure = lighting.brightness / _face_radiance(stage, head, bare + offset, samples)
     cameras = [
         place_camera(view, size, _random(seed, identity, "camera", index))
         for index, view in enumerate(viewpoints(views))
@@ -59,7 +61,6 @@ def generate_identity(
         for frame in range(frames):
             yield f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))
             glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
-            samples = int(_random(seed, identity, "samples", frame).integers(2**31))
             shader = Shader(
                 stage,
                 head,
@@ -103,14 +104,14 @@ def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.
     return np.random.default_rng([seed, identity, _STREAMS[stream], index])
 
 
-def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor) -> float:
+def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor, seed: int) -> float:
     """Mean radiance of a white, resting face."""
     from scenes.deferred import gather_light
 
     stage.pose(head, vertices)
     face = (head.masks["face"] > 0.5).nonzero()[:, 0]
     normals = vertex_normals(vertices, head.faces)
-    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES[1], 0)[:, :3]
+    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES[1], seed)[:, :3]
     return max(float(light.mean()), 1e-4)
 
 
