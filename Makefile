@@ -40,7 +40,8 @@ format: setup
 	$(BIN)/ruff format .
 
 bench: setup
-	$(BIN)/python -m benchmarks.rasterizer_speed
+	$(BIN)/python -m benchmarks.head_quality
+	$(BIN)/python -m benchmarks.rasterizer_table
 
 bake: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,bake]'
