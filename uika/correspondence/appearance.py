@@ -8,6 +8,7 @@ change smoothly with the surface's direction.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -23,10 +24,10 @@ from uika.correspondence.frames import (
     surface_model,
 )
 from uika.correspondence.turns import Array
-from uika.head import HeadModel, look_at, pose_vertices, project, rasterize, uv_texels
-from uika.head.parameters import HeadParameters
+from uika.head import HeadModel, look_at, project, rasterize, uv_texels
 
 SIDE = 224  # pixels of the face crop that is compared
+FRONT_SIZE = 640  # pixels, of the pictures that tell which points are visible
 ATLAS = 80  # texels along a side; about 900 of them lie on the face
 MARGIN = 1.3  # side of the crop over the landmarks' box
 VISIBLE, FACING = 0.2, 0.7  # cosines of the viewing angle between which a point gains trust
@@ -61,25 +62,31 @@ class View:
 
 def make_appearance(head: HeadModel, identity: torch.Tensor, focal: float, unit: float) -> Appearance:
     """An appearance that has seen nothing yet, for the visible points of the person's face."""
+    triangle, barycentric = _face_points(head)
+    model = surface_model(head, identity, focal, unit, triangle, barycentric)
+    model = replace(model, basis=model.basis.astype(np.float32))
+    blank = np.zeros(len(triangle))
+    return Appearance(model, blank, blank)
+
+
+@lru_cache(maxsize=4)
+def _face_points(head: HeadModel) -> tuple[torch.Tensor, torch.Tensor]:
+    """Triangles [M] and barycentrics [M,3] of evenly spread points on face and eyeballs that the mean head shows."""
     binding = uv_texels(head, ATLAS)
     shares = {name: (head.masks[name][head.faces[binding.triangle]] * binding.barycentric).sum(-1)
               for name in ("face", "eyeballs", "mouth_inner")}  # fmt: skip
     wanted = ((shares["face"] > 0.6) | (shares["eyeballs"] > 0.5)) & (shares["mouth_inner"] < 0.5)
-    keep = wanted & _in_front(head, identity)[binding.triangle]
-    model = surface_model(head, identity, focal, unit, binding.triangle[keep], binding.barycentric[keep])
-    model = replace(model, basis=model.basis.astype(np.float32))
-    blank = np.zeros(int(keep.sum()))
-    return Appearance(model, blank, blank)
+    keep = wanted & _in_front(head)[binding.triangle]
+    return binding.triangle[keep], binding.barycentric[keep]
 
 
-def _in_front(head: HeadModel, identity: torch.Tensor) -> torch.Tensor:
+def _in_front(head: HeadModel) -> torch.Tensor:
     """Triangles [F] of the neutral face that nothing covers from the front or half sides."""
-    vertices = pose_vertices(head, HeadParameters.zeros(head).replace(identity=identity.float()))
     seen = torch.zeros(len(head.faces), dtype=torch.bool)
     for yaw in (-30.0, 0.0, 30.0):
-        camera = look_at(yaw, 0.0, 1.0, head.joints[3:5].mean(0), fov_y=16.0, size=1024)
-        points, depth = project(vertices, camera)
-        triangle, _ = rasterize(points, head.faces, 1024, 1024, depth=depth)
+        camera = look_at(yaw, 0.0, 1.0, head.joints[3:5].mean(0), fov_y=16.0, size=FRONT_SIZE)
+        points, depth = project(head.template, camera)
+        triangle, _ = rasterize(points, head.faces, FRONT_SIZE, FRONT_SIZE, depth=depth)
         seen[triangle[triangle >= 0].unique()] = True
     return seen
 

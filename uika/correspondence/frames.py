@@ -190,7 +190,7 @@ def landmark_pull(model: FrameModel, pose: Pose, target: Array) -> tuple[Array, 
 
 def head_landmarks(model: FrameModel, pose: Pose) -> Array:
     """Landmarks [L,3] of an expression in head space, metres."""
-    parts = model.points + model.basis @ pose.expression
+    parts = model.points + model.basis @ pose.expression.astype(model.basis.dtype)
     place = parts[0]
     for part, share, pivot, turn in zip(parts[1:], model.share, model.pivots, pose.joints, strict=True):
         arm = part - share[:, None] * pivot
@@ -272,8 +272,9 @@ def bounded_step(model: FrameModel, pose: Pose, matrix: Array, gradient: Array) 
     free = np.ones(len(gradient), dtype=bool)
     free[:E] = model.free
     for _ in range(WALL_ROUNDS):
-        right = -gradient[free] - matrix[np.ix_(free, ~free)] @ step[~free]
-        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
+        rows = np.flatnonzero(free)
+        right = -(gradient + matrix @ np.where(free, 0.0, step))[rows]
+        step[rows] = np.linalg.solve(matrix[rows][:, rows], right)
         if not model.bounded:
             break
         moved = pose.expression + step[:E]

@@ -25,7 +25,7 @@ from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_per
 from uika.tracking.decode import VideoError, decode, frame_rate
 from uika.tracking.poses import poses_to_motion, without_gaps
 
-IDENTITY_FRAMES = 12  # the first guess of identity and focal length comes from these
+IDENTITY_FRAMES = 8  # the first guess of identity and focal length comes from these
 KEY_FRAMES = 12  # at least; the person's colours and final identity come from these
 MAX_FRAMES = 100_000
 
