@@ -27,9 +27,16 @@ _RECORD = 16  # floats for each corner of the mesh
 _GLASSES_ROUGHNESS = 0.3
 
 
-@lru_cache(maxsize=8)
 def lit_stage(head: HeadModel, light: Light) -> Stage:
-    """A stage for `Shader`, which needs no image size, that has been used once.
+    """A stage for `Shader`, which needs no image size, with the lamps of the scene file."""
+    stage = _used_stage(head, light)
+    stage.set_lights({})
+    return stage
+
+
+@lru_cache(maxsize=8)
+def _used_stage(head: HeadModel, light: Light) -> Stage:
+    """A stage that has been used once.
 
     Kernels that meet freshly loaded numbers differ in their last digits from all later ones; the first use goes here.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -36,6 +36,7 @@ class Stage:
     params: Any
     mesh: SeamMesh
     light: Light
+    plain_lights: dict[str, Any] = field(default_factory=dict)  # what the scene file says of lamps that were changed
 
     @property
     def sensor(self) -> Any:
@@ -96,7 +97,7 @@ class Stage:
             self._set("glasses.vertex_positions", hidden if glasses is None else glasses.points)
 
     def set_lights(self, values: Mapping[str, np.ndarray]) -> None:
-        """Set the lamps by their `mi.traverse` names; takes effect with `pose`.
+        """Set the lamps by their `mi.traverse` names, all others as the scene file has them; takes effect with `pose`.
 
         Args:
             values: colours [3], transforms [4,4] or pictures [H,W,3] of the size that the scene holds, all linear.
@@ -104,9 +105,13 @@ class Stage:
         Raises:
             ValueError: the scene has no such parameter.
         """
-        for name, value in values.items():
+        for name in values:
             if name not in self.params:
                 raise ValueError(f"the scene '{self.light}' has no parameter '{name}'")
+            self.plain_lights.setdefault(name, _copied(self.params[name]))
+        for name, plain in self.plain_lights.items():
+            _assign(self.params, name, _copied(plain))
+        for name, value in values.items():
             if value.ndim == 3:
                 # The scene keeps a few columns more, which repeat the first ones.
                 missing = self.params[name].shape[1] - value.shape[1]
@@ -169,6 +174,11 @@ def plain_sky(height: int = 32) -> np.ndarray:
     share = 1 / (1 + np.exp(-4 * up))
     picture = share * np.array(_SKY[0]) + (1 - share) * np.array(_SKY[1])
     return np.ascontiguousarray(np.broadcast_to(picture, (height, 2 * height, 3)), np.float32)
+
+
+def _copied(value: Any) -> Any:
+    """A parameter's value with storage of its own."""
+    return type(value)(value)
 
 
 def _assign(params: Any, key: str, value: Any) -> None:

@@ -85,7 +85,8 @@ def test_kinds_of_json(content: object, tmp_path: Path) -> None:
 
 def test_csv_round_trip(head: HeadModel, tmp_path: Path) -> None:
     motion = get_motion("expressions", head, 30.0)
-    motion = Motion(fps=30.0, **{**motion.tensors(), "rotation": torch.linspace(-0.4, 0.4, 3 * len(motion)).view(-1, 3)})
+    turning = torch.linspace(-0.4, 0.4, 3 * len(motion)).view(-1, 3)
+    motion = Motion(fps=30.0, **{**motion.tensors(), "rotation": turning})
     path = tmp_path / "face.csv"
     write_csv(motion, path, head.expression_names)
     assert path.read_text().startswith("Timecode,BlendShapeCount,EyeBlinkLeft,EyeLookDownLeft")

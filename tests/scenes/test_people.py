@@ -124,3 +124,15 @@ def test_lights_and_backdrops_are_seeded(face: HeadModel) -> None:
         assert picture.shape == (32, 32, 3) and picture.min() >= 0 and picture.max() <= 1
     with pytest.raises(ValueError, match="no parameter 'moon'"):
         lit_stage(face, "side").set_lights({"moon": np.zeros(3)})
+
+
+def test_changed_lamps_do_not_outlive_their_use(face: HeadModel) -> None:
+    def view() -> np.ndarray:
+        stage = lit_stage(face, "studio")
+        texture = as_texture(np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2), 0.5, np.float32))
+        return Shader(stage, face, face.template, texture).view(CAMERA, 1, ())["rgb"]
+
+    before = view()
+    stage = lit_stage(face, "studio")
+    stage.set_lights({"key.emitter.radiance.value": np.array([90.0, 10.0, 10.0], np.float32)})
+    np.testing.assert_array_equal(view(), before)
