@@ -63,7 +63,7 @@ def functions(scene: Scene) -> tuple[dict[str, Callable[[], object]], float]:
     import mitsuba as mi
 
     parameters = mi.traverse(world)
-    keys = [key for key in parameters if key.split(".")[-1] in ("data", "opacities", "sh_coeffs")]
+    keys = [key for key in parameters.keys() if key.split(".")[-1] in ("data", "opacities", "sh_coeffs")]  # noqa: SIM118
     leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
     weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
     theirs = mi.TensorXf(weight.numpy())

@@ -97,10 +97,15 @@ def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, settings: Setti
             yield exp2(be, log_opacity - dr.fma(a * x, x, d * y * y), degree)
         return
     ah = a * h
-    corner = exp2(be, log_opacity - dr.fma(a * s, s, d * t * t), degree)
+    exponent = log_opacity - dr.fma(a * s, s, d * t * t)
+    corner = exp2(be, exponent, degree)
     right = exp2(be, -a * dr.fma(2.0, s, 1.0), degree)
     down = exp2(be, -dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)), degree)
     bend_y = exp2(be, -2.0 * dr.fma(ah, h, d), degree)
+    if not settings.options.exact_tiles:
+        # A tile of the bounding box may lie so far from the ellipse that its corner underflows: nothing is seen there.
+        seen = exponent > -124.0
+        corner, right, down = (dr.select(seen, value, 0.0) for value in (corner, right, down))
     for row in range(TILE):
         value, ratio = corner, right
         for column in range(TILE):

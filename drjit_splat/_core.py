@@ -123,14 +123,21 @@ class Gradients:
     colors: Any | None  # [N * D]
 
 
+_capacities: set[int] = set()
+
+
 def capacity(n: int) -> int:
-    """A size of at least `n`, at most a quarter more, that takes few values.
+    """A size of at least `n` for sums over splats, from as few values as possible.
 
     Expanded scatter-additions compile the size of their target into the kernel, so exact sizes would recompile the
-    backward pass for every new number of splats.
+    backward pass for every new number of splats. A size in use serves down to half of it.
     """
-    step = max(256, power_of_two(n) // 8)
-    return -(-n // step) * step
+    fitting = [size for size in _capacities if n <= size <= 2 * n + 256]
+    if not fitting:
+        step = max(256, power_of_two(n) // 8)
+        fitting = [-(-n // step) * step]
+        _capacities.update(fitting)
+    return min(fitting)
 
 
 def backward(
