@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import secrets
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ._inputs import check_finite
@@ -26,6 +29,7 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
+_KINDS = ("binary_little_endian", "binary_big_endian", "ascii")
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)))
 _QUAT = tuple(f"rot_{i}" for i in range(4))
 
@@ -51,51 +55,83 @@ class SplatFile:
         return 0.5 + _C0 * self.harmonics[:, 0]
 
 
-def _read_header(path: Path) -> tuple[int, list[tuple[str, str]], int]:
-    """Vertex count, (name, numpy type) of every property, and the header's length in bytes."""
+@dataclass(frozen=True)
+class _Header:
+    count: int  # vertices
+    properties: list[tuple[str, str]]  # name and numpy type
+    kind: str  # one of _KINDS
+    length: int  # bytes before the first vertex
+
+
+def _read_header(path: Path) -> _Header:
     with path.open("rb") as file:
         start = file.read(_HEADER_LIMIT)
-    end = start.find(b"end_header\n")
-    if not start.startswith(b"ply") or end < 0:
+    marker = start.find(b"end_header")
+    end = start.find(b"\n", marker) + 1
+    if not start.startswith(b"ply") or marker < 0 or end == 0:
         raise ValueError(f"{path} is not a .ply file (no header that starts with 'ply' and ends with 'end_header')")
-    lines = [line.split() for line in start[:end].decode("ascii", "replace").splitlines()]
-    if ["format", "binary_little_endian", "1.0"] not in lines:
-        raise ValueError(f"{path} is not binary_little_endian; write it in that format")
-    elements = [line for line in lines if line[:1] == ["element"]]
-    if len(elements) != 1 or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
-        raise ValueError(f"{path} must hold one 'element vertex <count>' and nothing else")
+    lines = [line.split() for line in start[:marker].decode("ascii", "replace").splitlines()]
+    kind = next((line[1] for line in lines if line[:1] == ["format"] and line[2:] == ["1.0"]), "")
+    if kind not in _KINDS:
+        raise ValueError(f"{path} is of none of the formats {', '.join(_KINDS)}")
+    elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
+    first = lines[elements[0]] if elements else []
+    if first[1:2] != ["vertex"] or not first[-1].isdigit():
+        raise ValueError(f"{path} must start with one 'element vertex <count>'")
     properties = []
-    for line in lines:
+    for line in lines[: elements[1] if len(elements) > 1 else None]:
         if line[:1] == ["property"]:
             if len(line) != 3 or line[1] not in _TYPES:
                 raise ValueError(f"{path} has a property that cannot be read: {' '.join(line)!r}")
             properties.append((line[2], _TYPES[line[1]]))
     if len({name for name, _ in properties}) != len(properties):
         raise ValueError(f"{path} names a property twice")
-    return int(elements[0][-1]), properties, end + len(b"end_header\n")
+    return _Header(int(first[-1]), properties, kind, end)
+
+
+def _read_rows(path: Path, header: _Header) -> NDArray[np.void]:
+    """One record for each vertex."""
+    layout = np.dtype(header.properties)
+    if header.kind == "ascii":
+        return _read_text(path, header, layout)
+    expected, size = header.length + header.count * layout.itemsize, path.stat().st_size
+    if size < expected:
+        raise ValueError(f"{path} is cut short: {header.count} splats need {expected} bytes, the file has {size}")
+    stored = layout.newbyteorder(">") if header.kind == "binary_big_endian" else layout
+    return np.fromfile(path, stored, header.count, offset=header.length)
+
+
+def _read_text(path: Path, header: _Header, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    with path.open("rb") as file:
+        file.seek(header.length)
+        words = file.read().split()
+    needed = header.count * len(header.properties)
+    if len(words) < needed:
+        raise ValueError(f"{path} is cut short: {header.count} splats need {needed} numbers, the file has {len(words)}")
+    try:
+        values = np.array(words[:needed], dtype=np.float64).reshape(header.count, -1)
+    except ValueError as error:
+        raise ValueError(f"{path} has a word among its numbers ({error})") from None
+    return np.rec.fromarrays(list(values.T), dtype=layout)
 
 
 def load_ply(path: str | os.PathLike[str]) -> SplatFile:
-    """Read a splat file with harmonics of degree 0 to 3; further properties are ignored.
+    """Read a splat file with harmonics of degree 0 to 3, binary or text; further properties and elements are ignored.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is no splat file, is cut short, or holds a NaN or an infinity.
     """
     path = Path(path)
-    count, properties, offset = _read_header(path)
-    names = [name for name, _ in properties]
+    header = _read_header(path)
+    count, names = header.count, [name for name, _ in header.properties]
     missing = [name for name in (*_NEEDED, *_QUAT) if name not in names]
     if missing:
         raise ValueError(f"{path} has no property {missing[0]!r}; is it a splat file?")
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise ValueError(f"{path} has {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
-    layout = np.dtype(properties)
-    expected, size = offset + count * layout.itemsize, path.stat().st_size
-    if size < expected:
-        raise ValueError(f"{path} is cut short: {count} splats need {expected} bytes, the file has {size}")
-    table = np.fromfile(path, layout, count, offset=offset)
+    table = _read_rows(path, header)
 
     def columns(*chosen: str) -> Tensor:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in chosen], -1))
@@ -127,8 +163,11 @@ def save_ply(
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
     colors: Tensor,  # [N, 3] or [N, K, 3]
+    *,
+    extra: Mapping[str, Tensor] | None = None,  # [N] each
+    comments: Sequence[str] = (),
 ) -> None:
-    """Write a splat file that 3DGS viewers read.
+    """Write a splat file that 3DGS viewers read; it appears under its name only when it is complete.
 
     Args:
         path: file to write.
@@ -137,6 +176,8 @@ def save_ply(
         scales: [N, 3] standard deviations (stored as logarithms; zeros become 1e-12).
         opacities: [N] in [0, 1] (stored as logits, held 1e-6 away from 0 and 1).
         colors: [N, 3] colours, or [N, K, 3] harmonics with K 1, 4, 9 or 16.
+        extra: further float properties by name, one value a splat.
+        comments: lines for the header; other characters than printable ASCII become question marks.
 
     Raises:
         ValueError: a tensor has a wrong shape or holds a NaN or an infinity.
@@ -149,6 +190,7 @@ def save_ply(
         "scales": (scales, (n, 3)),
         "opacities": (opacities, (n,)),
         "colors": (harmonics, (n, harmonics.shape[1], 3)),
+        **{name: (tensor, (n,)) for name, tensor in (extra or {}).items()},
     }
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != shape:
@@ -158,7 +200,7 @@ def save_ply(
     check_finite(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
     rest = 3 * (harmonics.shape[1] - 1)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{i}" for i in range(rest)] + ["opacity", "scale_0", "scale_1", "scale_2", *_QUAT]
+    names += [f"f_rest_{i}" for i in range(rest)] + ["opacity", "scale_0", "scale_1", "scale_2", *_QUAT, *(extra or {})]
     parts = [
         means,
         torch.zeros_like(means),
@@ -167,10 +209,24 @@ def save_ply(
         torch.logit(opacities.double(), eps=1e-6)[:, None],
         scales.double().clamp_min(1e-12).log(),
         quats,
+        *(tensor[:, None] for tensor in (extra or {}).values()),
     ]
     table = torch.cat([part.detach().cpu().to(torch.float32) for part in parts], 1).numpy()
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
-    with Path(path).open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {_printable(line)}" for line in comments)]
+    header += [f"element vertex {n}", *(f"property float {name}" for name in names), "end_header", ""]
+    text = "\n".join(header).encode("ascii")
+    if len(text) > _HEADER_LIMIT:
+        raise ValueError(f"comments: the header would have {len(text)} bytes, more than {_HEADER_LIMIT}")
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(text)
+            file.write(np.ascontiguousarray(table, dtype="<f4").tobytes())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if " " <= letter <= "~" else "?" for letter in text)

@@ -71,7 +71,11 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         "is not a .ply file": b"solid" + whole,
         "no property 'opacity'": whole.replace(b"float opacity", b"float opacitx"),
         "0, 9, 24 or 45": whole.replace(b"property float nx", b"property float f_rest_0"),
-        "binary_little_endian": whole.replace(b"binary_little_endian", b"ascii"),
+        "of none of the formats": whole.replace(b"binary_little_endian", b"binary_pdp_endian"),
+        "has a word": whole.split(b"format")[0]
+        + b"format ascii 1.0"
+        + whole[whole.index(b"1.0") + 3 : whole.index(b"end_header") + 11]
+        + b"one " * 680,
         "element vertex": whole.replace(b"element vertex 40", b"element vertex -4"),
         "cannot be read": whole.replace(b"property float nx", b"property list uchar int nx"),
         "twice": whole.replace(b"property float nx", b"property float x"),
@@ -89,6 +93,39 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         load_ply(path)
     with pytest.raises(FileNotFoundError):
         load_ply(tmp_path / "none.ply")
+
+
+def test_text_big_endian_and_further_elements_are_read(tmp_path: Path) -> None:
+    given = splats(harmonics=4)
+    path = tmp_path / "a.ply"
+    save_ply(path, **given, extra={"binding_0": torch.arange(40.0)}, comments=["made by\nümlaut"])
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    assert b"comment made by??mlaut\n" in header
+    rows = np.frombuffer(body, "<f4").reshape(40, -1)
+    assert rows[:, -1].tolist() == list(range(40))
+    text = "\n".join(" ".join(f"{value:.9g}" for value in row) for row in rows).encode()
+    more = header + b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    others = {
+        "ascii": more.replace(b"binary_little_endian", b"ascii") + text + b"\n3 0 1 2\n",
+        "binary_big_endian": more.replace(b"little", b"big") + rows.astype(">f4").tobytes() + b"\x03" + b"\0" * 12,
+        "carriage returns": (header + b"end_header\n").replace(b"\n", b"\r\n") + body,
+    }
+    for name, data in others.items():
+        (tmp_path / "b.ply").write_bytes(data)
+        found = load_ply(tmp_path / "b.ply")
+        for key, value in vars(load_ply(path)).items():
+            assert torch.equal(value, vars(found)[key]), (name, key)
+
+
+def test_interrupted_write_keeps_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    save_ply(path, **splats())
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"^binding_0 must have the shape"):
+        save_ply(path, **splats(), extra={"binding_0": torch.zeros(3)})
+    with pytest.raises(ValueError, match=r"^comments"):
+        save_ply(path, **splats(), comments=["x" * 70_000])
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 def test_wrong_tensors_are_named(tmp_path: Path) -> None:
