@@ -16,7 +16,7 @@ from ._settings import Settings
 
 UNDERFLOW = 126 * math.log(2.0)  # nats
 
-UNROLL = 2
+UNROLL = 3
 """List entries a turn of the loop. Every turn saves and selects all sums, and waits for its gathers, once."""
 
 SIGN = 0x80000000
@@ -133,13 +133,9 @@ def step(be: Backend, alpha: Any, transmittance: Any, settings: Settings) -> tup
     return alive, dr.select(alive, alpha * transmittance, 0.0), dr.select(alive, after, stopped)
 
 
-def entries(be: Backend, lists: TileLists, k: Any, stop: Any) -> list[tuple[Any, Any]]:
-    """The next UNROLL list entries of each lane and whether they come before `stop`."""
-    found = []
-    for j in range(UNROLL):
-        active = k + j < stop
-        found.append((dr.gather(be.plain.UInt32, lists.ids, k + j, active), active))
-    return found
+def entries(be: Backend, lists: TileLists, k: Any, stop: Any, count: int) -> list[Any]:
+    """The next `count` list entries of each lane, zeros from `stop` on."""
+    return [dr.gather(be.plain.UInt32, lists.ids, k + j, k + j < stop) for j in range(count)]
 
 
 def all_done(be: Backend, transmittances: list[Any]) -> Any:
@@ -173,10 +169,12 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     tile = tile_of(be, lists.order, lists, settings)
     pixels = tile.pixels()
 
-    def body(k: Any, state: list[list[Any]]) -> tuple[Any, list[list[Any]]]:
+    def body(k: Any, splats: list[Any], state: list[list[Any]]) -> tuple[Any, list[Any], list[list[Any]]]:
         state = [list(pixel) for pixel in state]
         ramps, values = [], []
-        for splat, active in entries(be, lists, k, tile.last):
+        following = entries(be, lists, k + UNROLL, tile.last, UNROLL)
+        for j, splat in enumerate(splats):
+            active = k + j < tile.last
             geometry = packet(be, records, 2 * splat, 8, active)
             values.append(read_features(be, records, splat, features, active))
             ramps.append(raw_alphas(be, geometry, *offsets(be, tile, geometry), settings, active))
@@ -185,9 +183,9 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
                 _, weight, pixel[0] = step(be, clamped_alpha(raw, settings), pixel[0], settings)
                 for f in range(features):
                     pixel[1 + f] = dr.fma(weight, value[f], pixel[1 + f])
-        return k + UNROLL, state
+        return k + UNROLL, following, state
 
-    def go_on(k: Any, state: list[list[Any]]) -> Any:
+    def go_on(k: Any, splats: list[Any], state: list[list[Any]]) -> Any:
         left = k < tile.last
         return left & ~all_done(be, [pixel[0] for pixel in state]) if settings.options.stop_early else left
 
@@ -195,8 +193,9 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     start = [
         [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(features))] for _, inside in pixels
     ]
-    k, state = dr.while_loop(
-        (tile.first, start),
+    # The splats of a turn are read a turn ahead: their records are gathers at addresses that wait for them.
+    k, _, state = dr.while_loop(
+        (tile.first, entries(be, lists, tile.first, tile.last, UNROLL), start),
         go_on,
         body,
         mode="symbolic",

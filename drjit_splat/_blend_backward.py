@@ -8,7 +8,6 @@ import drjit as dr
 
 from ._backend import TILE, Backend, add_packet, packet, power_of_two
 from ._blend import (
-    UNROLL,
     Blended,
     clamped_alpha,
     entries,
@@ -22,6 +21,7 @@ from ._lists import TileLists
 from ._project import RECORD
 from ._settings import Settings
 
+UNROLL = 2  # see `_blend.UNROLL`; the adjoint of one entry is long enough to hide its gathers
 MOMENTS = 8  # sums of v, v s, v t, v s^2, v s t, v t^2 with v = alpha dL/dalpha, s = dx + h dy, t = dy; 2 spare
 
 
@@ -65,7 +65,8 @@ def blend_backward(
 
     def body(k: Any, transmittances: list[Any], behind: list[Any]) -> tuple[Any, list[Any], list[Any]]:
         transmittances, behind = list(transmittances), list(behind)
-        for splat, active in entries(be, lists, k, stop):
+        for j, splat in enumerate(entries(be, lists, k, stop, UNROLL)):
+            active = k + j < stop
             geometry = packet(be, records, 2 * splat, 8, active)
             values = read_features(be, records, splat, features, active)
             s, t = offsets(be, tile, geometry)

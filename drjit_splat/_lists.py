@@ -19,6 +19,7 @@ DIGIT_BITS = 12  # widest digit whose bucket counts stay in the first-level cach
 BYTES_PER_PAIR = 24
 REGION = 16  # tiles along each side of a region: its splats fit the second-level cache
 LENGTH_BUCKETS = 1024  # longer lists count as equally long when lanes are matched
+EMIT_BLOCK = 4096  # splats among which lanes are matched; what they emit fits the second-level cache
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def _emit(
     dr.eval(counts, clipped)
     begin = dr.prefix_sum(counts)
     # The places are known, so lanes may take the splats in any order: those of a packet get equally large ones.
-    lane = dr.detail.block_mkperm(clipped, dr.width(counts), LENGTH_BUCKETS)
+    lane = dr.detail.block_mkperm(clipped, EMIT_BLOCK, LENGTH_BUCKETS)
     order, begin, counts = (dr.gather(J.UInt32, values, lane) for values in (order, begin, counts))
     tile, splat = dr.empty(J.UInt32, projected.pairs), dr.empty(J.UInt32, projected.pairs)
     foot = Footprint(*packet(be, projected.footprints, order, 8))
