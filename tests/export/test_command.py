@@ -1,0 +1,67 @@
+from pathlib import Path
+
+import pytest
+
+from drjit_splat import load_ply
+from tests.avatars import painted_avatar
+from tests.heads import sphere_head
+from uika import load_head
+from uika.cli import main
+from uika.export import glb_provenance, html_provenance, read_splat
+from uika.head import save_head
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    save_head(sphere_head(), tmp_path / "small.npz")
+    monkeypatch.setenv("UIKA_HEAD", str(tmp_path / "small.npz"))
+    painted_avatar(load_head(), 32).save(tmp_path / "a.safetensors")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return tmp_path / "work"
+
+
+def test_every_format_is_written(folder, capsys):
+    def export(*arguments: str) -> str:
+        assert main(["export", "../a.safetensors", *arguments]) == 0
+        return capsys.readouterr().out
+
+    assert "Y down" in export("-o", "a.ply") and "Y up" in export("-o", "b.ply", "--axes", "y-up")
+    assert load_ply("a.ply").means[:, 1].tolist() == (-load_ply("b.ply").means[:, 1]).tolist()
+    export("-o", "a.splat", "--motion", "talk", "--frame", "5", "--count", "100")
+    assert len(read_splat("a.splat")) == 100
+    export("-o", "a.glb")
+    assert glb_provenance("a.glb")["photos"] == "none"
+    assert "85 frames" in export("-o", "a.html")
+    assert html_provenance("a.html")["photos"] == "none"
+    assert "100 frames" in export("-o", "a.npz", "--motion", "orbit")
+    assert "bound" in export("-o", "c.ply", "--with-binding")
+    assert "85 files" in export("-o", "frames", "--motion", "talk")
+    assert len(list(Path("frames").iterdir())) == 85
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["-o", "a.obj"], "a.obj: the output's name must end in .ply"),
+        (["-o", "frames"], "needs --motion"),
+        (["-o", "a.ply", "--motion", "talk"], "add --frame"),
+        (["-o", "a.ply", "--frame", "3"], "--frame needs --motion"),
+        (["-o", "a.ply", "--motion", "talk", "--frame", "85"], "between 0 and 84"),
+        (["-o", "a.glb", "--with-binding"], "--with-binding"),
+        (["-o", "a.glb", "--axes", "y-up"], "--axes"),
+        (["-o", "a.ply", "--count", "0"], "count"),
+        (["-o", "a.html", "--motion", "dance"], "dance"),
+    ],
+)
+def test_wrong_input_is_one_sentence(folder, capsys, arguments, says):
+    assert main(["export", "../a.safetensors", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert says in err and err.count("\n") == 1
+    assert list(folder.iterdir()) == []
+
+
+def test_help_has_an_example(capsys):
+    assert main(["export", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "Example: uika export" in out and out.count("\n") < 40

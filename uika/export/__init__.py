@@ -1,0 +1,25 @@
+"""Avatars in the file formats of other programs."""
+
+from uika.export.flat import read_splat, write_splat
+from uika.export.gltf import glb_provenance, read_glb, write_glb
+from uika.export.html import html_provenance, write_html
+from uika.export.ply import write_bound_ply, write_ply, write_ply_sequence
+from uika.export.splats import Splats, posed_splats, thinned
+from uika.export.tables import write_npz
+
+__all__ = [
+    "Splats",
+    "glb_provenance",
+    "html_provenance",
+    "posed_splats",
+    "read_glb",
+    "read_splat",
+    "thinned",
+    "write_bound_ply",
+    "write_glb",
+    "write_html",
+    "write_npz",
+    "write_ply",
+    "write_ply_sequence",
+    "write_splat",
+]

@@ -1,0 +1,152 @@
+"""Splat `.ply` files: canonical or posed, bound to the mesh, or one for each frame of a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from uika.avatar import Avatar
+from uika.errors import UikaError
+from uika.export.splats import Splats, posed_splats
+from uika.files import check_folder, check_output, replacing
+from uika.head import HeadModel
+from uika.motion import Motion
+from uika.progress import counted
+
+_FLAME_SHAPES, _FLAME_EXPRESSIONS = 300, 100
+
+
+def write_ply(path: str | Path, splats: Splats, provenance: Mapping[str, str] | None = None) -> None:
+    """Write Gaussians in the layout of 3DGS.
+
+    Args:
+        path: `.ply` file.
+        splats: Gaussians in the axes that the reader assumes; most viewers assume Y down (`Splats.half_turned()`).
+        provenance: written as comments into the header.
+
+    Raises:
+        UikaError: wrong extension, or nothing can be written there.
+    """
+    from drjit_splat import save_ply
+
+    target = check_output(path, ".ply")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save_ply(
+        target,
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        splats.colors,
+        comments=[f"{key}: {value}" for key, value in (provenance or {}).items()],
+    )
+
+
+def write_ply_sequence(
+    folder: str | Path, avatar: Avatar, motion: Motion, head: HeadModel, *, y_down: bool = True, progress: bool = False
+) -> int:
+    """Write `frame_00000.ply` and so on, one file for each frame of a motion.
+
+    Returns:
+        The number of files.
+
+    Raises:
+        UikaError: the folder cannot be made or written to.
+    """
+    place = check_folder(folder)
+    params = motion.parameters(avatar.identity)
+    for index in counted(range(len(motion)), progress, len(motion), "frames"):
+        splats = posed_splats(avatar, head, params[index])
+        write_ply(place / f"frame_{index:05d}.ply", splats.half_turned() if y_down else splats, avatar.provenance)
+    return len(motion)
+
+
+def write_bound_ply(path: str | Path, avatar: Avatar, head: HeadModel) -> Path | None:
+    """Write Gaussians as GaussianAvatars binds them: relative to a triangle, with its number in `binding_0`.
+
+    Each Gaussian's centre, rotation and scale are those of the canonical avatar seen from its triangle's centre, axes
+    and size (see `triangle_frames`). There is no turn to Y down: the triangles say where the head is.
+
+    Args:
+        path: `.ply` file.
+        avatar: the avatar.
+        head: the head model that it was made for.
+
+    Returns:
+        The file `flame_param.npz` that was written beside it with the identity at rest, if the head is a FLAME head;
+        None for another head, which GaussianAvatars itself cannot move.
+
+    Raises:
+        UikaError: wrong extension, or nothing can be written there.
+    """
+    from drjit_splat import save_ply
+
+    target = check_output(path, ".ply")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    centre, rotation, size = triangle_frames(avatar.canonical_vertices(head), head.faces)
+    turn, length = rotation[avatar.triangle], size[avatar.triangle][:, None]
+    local = (turn.mT @ (avatar.means - centre[avatar.triangle])[..., None])[..., 0] / length
+    save_ply(
+        target,
+        local,
+        _multiply(_conjugate(_from_matrix(rotation))[avatar.triangle], avatar.quats),
+        avatar.scales / length,
+        avatar.opacities,
+        avatar.colors,
+        extra={"binding_0": avatar.triangle.float()},
+        comments=[f"{key}: {value}" for key, value in avatar.provenance.items()],
+    )
+    return _write_flame(target, avatar, head) if head.id.startswith("flame-") else None
+
+
+def triangle_frames(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres [F,3], rotations [F,3,3] and sizes [F] of the triangles of a mesh [V,3], as GaussianAvatars defines them.
+
+    The columns of a rotation are the first edge, the normal, and the direction square to both; the size is the mean of
+    the first edge and the height above it.
+    """
+    a, b, c = vertices[faces].unbind(1)
+    along = torch.nn.functional.normalize(b - a, dim=-1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(along, c - a), dim=-1)
+    across = torch.linalg.cross(along, normal)
+    size = ((b - a).norm(dim=-1) + ((c - a) * across).sum(-1).abs()) / 2
+    return (a + b + c) / 3, torch.stack((along, normal, across), -1), size
+
+
+def _write_flame(target: Path, avatar: Avatar, head: HeadModel) -> Path:
+    beside = target.with_name("flame_param.npz")
+    if len(avatar.identity) > _FLAME_SHAPES or len(head.expression_names) > _FLAME_EXPRESSIONS:
+        raise UikaError(f"{beside}: FLAME parameters hold at most 300 shapes and 100 expressions")
+    sizes = {"rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3, "expr": 100}
+    arrays = {name: np.zeros((1, size), np.float32) for name, size in sizes.items()}
+    shape = np.zeros(_FLAME_SHAPES, np.float32)
+    shape[: len(avatar.identity)] = avatar.identity.numpy()
+    with replacing(beside) as temporary, temporary.open("wb") as file:
+        np.savez(file, shape=shape, static_offset=avatar.static_offset.numpy()[None], **arrays)  # type: ignore[arg-type]
+    return beside
+
+
+def _from_matrix(rotation: Tensor) -> Tensor:
+    """Quaternions [N,4] (wxyz) of rotations [N,3,3]: the main eigenvector of Bar-Itzhack's symmetric matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.double().unbind(-2))
+    rows = (a + e + i, h - f, c - g, d - b, a - e - i, b + d, c + g, e - a - i, f + h, i - a - e)
+    matrix = torch.zeros(len(rotation), 4, 4, dtype=torch.float64)
+    upper = torch.triu_indices(4, 4)
+    matrix[:, upper[0], upper[1]] = torch.stack(rows, -1)
+    matrix[:, upper[1], upper[0]] = torch.stack(rows, -1)
+    return torch.linalg.eigh(matrix).eigenvectors[..., -1].float()
+
+
+def _conjugate(quats: Tensor) -> Tensor:
+    return quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+
+
+def _multiply(one: Tensor, other: Tensor) -> Tensor:
+    """Hamilton products [N,4], wxyz."""
+    a, b = one[:, :1], one[:, 1:]
+    c, d = other[:, :1], other[:, 1:]
+    return torch.cat((a * c - (b * d).sum(-1, keepdim=True), a * d + c * b + torch.linalg.cross(b, d)), -1)
