@@ -1,4 +1,4 @@
-"""Put the measured tables of `benchmarks/results/NAME.md` between the README's markers `<!-- figures: NAME -->`."""
+"""Put the tables of `benchmarks/results/NAME.md` between the markers `<!-- figures: NAME -->` of README and docs."""
 
 import re
 import sys
@@ -8,7 +8,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MARKED = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def main(readme: Path = ROOT / "README.md") -> int:
+def main() -> int:
     missing = []
 
     def table(match: re.Match[str]) -> str:
@@ -16,9 +16,11 @@ def main(readme: Path = ROOT / "README.md") -> int:
         if not path.is_file():
             missing.append(path)
             return match[0]
-        return f"{match[1]}{path.read_text().strip()}\n{match[3]}"
+        lines = [line for line in path.read_text().strip().splitlines() if not line.startswith(("# ", "![]("))]
+        return f"{match[1]}{chr(10).join(lines).strip()}\n{match[3]}"
 
-    readme.write_text(MARKED.sub(table, readme.read_text()))
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        page.write_text(MARKED.sub(table, page.read_text()))
     for path in missing:
         print(f"no {path.relative_to(ROOT)}: run the benchmark first", file=sys.stderr)
     return 1 if missing else 0
