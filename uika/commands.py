@@ -82,8 +82,9 @@ class Animate:
         target = check_output(self.output, ".mp4")
         from uika.acting import get_motion
         from uika.avatar import Avatar
+        from uika.filming import film
         from uika.head import load_head
-        from uika.rendering import check_renderer, check_view, frames
+        from uika.rendering import check_renderer, check_view
         from uika.video import check_even, write_video
 
         check_view(0.0, 0.0, check_even(self.size))
@@ -95,8 +96,7 @@ class Animate:
         check_renderer()
         if self.video is not None:
             motion = self._tracked(self.video, head)
-        pictures = frames(avatar, motion, head=head, size=self.size, progress=True)
-        count = write_video(target, (picture.rgb for picture in pictures), motion.fps)
+        count = write_video(target, film(avatar, motion, head=head, size=self.size, progress=True), motion.fps)
         print(f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second")
         return 0
 
@@ -161,9 +161,10 @@ class Demo:
         names = ("avatar.safetensors", "talk.mp4", "sheet.png")
         avatar_file, video, picture = (check_output(folder / name, Path(name).suffix) for name in names)
         from uika.acting import get_motion
+        from uika.filming import film
         from uika.head import load_head
         from uika.reconstruction import reconstruct
-        from uika.rendering import check_renderer, frames
+        from uika.rendering import check_renderer
         from uika.sheet import reconstruction_sheet
         from uika.video import write_png, write_video
 
@@ -175,8 +176,7 @@ class Demo:
             write_png(picture, reconstruction_sheet(result, head))
         with result.report.stage("video"):
             motion = get_motion("talk", head)
-            moving = frames(result.avatar, motion, head=head, progress=True)
-            write_video(video, (frame.rgb for frame in moving), motion.fps)
+            write_video(video, film(result.avatar, motion, head=head, progress=True), motion.fps)
         _print_seconds(result.report)
         for path in (avatar_file, picture, video):
             print(f"wrote {path}")

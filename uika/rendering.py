@@ -101,7 +101,7 @@ def frames(
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     canonical = avatar.canonical_vertices(model)
     params = motion.parameters(avatar.identity)
-    for index in _counted(len(motion), progress):
+    for index in counted(len(motion), progress):
         camera = path[index]
         yield render(avatar, params[index], camera, model, background, canonical=canonical)
 
@@ -118,14 +118,7 @@ def neutral_camera(avatar: Avatar, yaw: float = 0.0, pitch: float = 0.0, size: i
     Raises:
         UikaError: an angle or the size is out of range.
     """
-    check_view(yaw, pitch, size)
-    ends = torch.tensor([_STRAYS, 1 - _STRAYS])
-    low, high = torch.quantile(avatar.means, ends, dim=0)
-    centre = (low + high) / 2
-    reach = (avatar.means[:, [0, 2]] - centre[[0, 2]]).norm(dim=-1)
-    radius = max(float(torch.quantile(reach, 1 - _STRAYS)), float(high[1] - low[1]) / 2)
-    distance = _MARGIN * radius / math.tan(math.radians(_FOV / 2))
-    return look_at(yaw, pitch, distance, centre, fov_y=_FOV, size=size)
+    return _view(_frame(avatar), yaw, pitch, size)
 
 
 def motion_cameras(avatar: Avatar, motion: Motion, size: int = 512) -> Camera:
@@ -133,11 +126,28 @@ def motion_cameras(avatar: Avatar, motion: Motion, size: int = 512) -> Camera:
     rest = torch.zeros(len(motion))
     yaw = rest if motion.yaw is None else motion.yaw
     pitch = rest if motion.pitch is None else motion.pitch
+    frame = _frame(avatar)
     seen: dict[tuple[float, float], Camera] = {}
     for view in zip(yaw.tolist(), pitch.tolist(), strict=True):
         if view not in seen:
-            seen[view] = neutral_camera(avatar, *view, size)
+            seen[view] = _view(frame, *view, size)
     return Camera.stack([seen[view] for view in zip(yaw.tolist(), pitch.tolist(), strict=True)])
+
+
+def _frame(avatar: Avatar) -> tuple[Tensor, float]:
+    """Centre [3] of the resting avatar and the distance in metres from which it fills the picture."""
+    ends = torch.tensor([_STRAYS, 1 - _STRAYS])
+    low, high = torch.quantile(avatar.means, ends, dim=0)
+    centre = (low + high) / 2
+    reach = (avatar.means[:, [0, 2]] - centre[[0, 2]]).norm(dim=-1)
+    radius = max(float(torch.quantile(reach, 1 - _STRAYS)), float(high[1] - low[1]) / 2)
+    return centre, _MARGIN * radius / math.tan(math.radians(_FOV / 2))
+
+
+def _view(frame: tuple[Tensor, float], yaw: float, pitch: float, size: int) -> Camera:
+    check_view(yaw, pitch, size)
+    centre, distance = frame
+    return look_at(yaw, pitch, distance, centre, fov_y=_FOV, size=size)
 
 
 def check_view(yaw: float, pitch: float, size: int) -> None:
@@ -168,7 +178,8 @@ def check_renderer() -> None:
         raise UikaError(str(error)) from error
 
 
-def _counted(count: int, progress: bool) -> Iterable[int]:
+def counted(count: int, progress: bool) -> Iterable[int]:
+    """The numbers of the frames, with a progress bar on stderr if asked for."""
     if not progress:
         return range(count)
     try:

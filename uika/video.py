@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,10 +16,16 @@ from uika.errors import UikaError
 from uika.files import check_output, replacing
 
 _QUALITY = "18"  # x264's constant rate factor; visually lossless for most eyes
+_AHEAD = 4  # pictures that may wait for the encoder
 
 
-def to_bytes(rgb: Tensor) -> NDArray[np.uint8]:
-    """An image [H,W,3] in [0,1] as bytes; values outside are clipped."""
+Picture = Tensor | NDArray[np.uint8]  # [H,W,3], floats in [0,1] or bytes
+
+
+def to_bytes(rgb: Picture) -> NDArray[np.uint8]:
+    """An image [H,W,3] in [0,1] as bytes; values outside are clipped. Bytes are passed on."""
+    if isinstance(rgb, np.ndarray):
+        return rgb
     return (rgb.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
@@ -34,8 +42,10 @@ def write_png(path: str | Path, rgb: Tensor) -> None:
         Image.fromarray(to_bytes(rgb)).save(temporary)
 
 
-def write_video(path: str | Path, pictures: Iterable[Tensor], fps: float) -> int:
-    """Write images [H,W,3] in [0,1] as H.264 in an MP4 that every player opens.
+def write_video(path: str | Path, pictures: Iterable[Picture], fps: float) -> int:
+    """Write images [H,W,3] in [0,1], or as bytes, as H.264 in an MP4 that every player opens.
+
+    The encoder works in a thread of its own while the next pictures are made.
 
     Args:
         path: the file; it must end in .mp4.
@@ -52,10 +62,19 @@ def write_video(path: str | Path, pictures: Iterable[Tensor], fps: float) -> int
 
     target = check_output(path, ".mp4")
     count, shape = 0, None
-    with replacing(target) as temporary, av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
+    with (
+        replacing(target) as temporary,
+        av.open(str(temporary), "w", options={"movflags": "faststart"}) as container,
+        ThreadPoolExecutor(1) as encoder,
+    ):
+        pending: deque[Future[None]] = deque()
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": _QUALITY}
+
+        def encode(image: NDArray[np.uint8]) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+
         for picture in pictures:
             image = to_bytes(picture)
             if shape is None:
@@ -63,10 +82,14 @@ def write_video(path: str | Path, pictures: Iterable[Tensor], fps: float) -> int
                 stream.height, stream.width = check_even(shape[0]), check_even(shape[1])
             if image.shape != shape:
                 raise UikaError(f"{target}: frame {count} has the size {image.shape[:2]}, the first one {shape[:2]}")
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            pending.append(encoder.submit(encode, image))
+            if len(pending) > _AHEAD:
+                pending.popleft().result()
             count += 1
         if count == 0:
             raise UikaError(f"{target}: there are no frames to write")
+        while pending:
+            pending.popleft().result()
         container.mux(stream.encode())
     return count
 

@@ -11,9 +11,9 @@ from uika.head.model import HeadModel
 from uika.head.parameters import HeadParameters
 from uika.head.posing import joint_transforms
 
-_SMALL = 1e-18
-_FLAT = 1e-6  # twice the area over the longest edge squared, below which a triangle counts as flat
-_SCALE_RANGE = (0.5, 2.0)
+SMALL = 1e-18
+FLAT = 1e-6  # twice the area over the longest edge squared, below which a triangle counts as flat
+SCALE_RANGE = (0.5, 2.0)
 
 
 def surface_points(vertices: Tensor, faces: Tensor, binding: Binding) -> Tensor:
@@ -90,13 +90,31 @@ def pose_gaussians(
     lead = (1,) * (moved.ndim - 2)
     offset = _components_first(means - _interpolate(canonical_vertices, corners, barycentric)).view(3, *lead, -1)
     v, uvw = _components_first(quats).view(4, *lead, -1).split((1, 3))
-    w, xyz = (moved[3:7] * _dot(moved[3:7], moved[3:7]).clamp_min(_SMALL).rsqrt()).split((1, 3))
+    w, xyz = (moved[3:7] * _dot(moved[3:7], moved[3:7]).clamp_min(SMALL).rsqrt()).split((1, 3))
     twice = 2 * _cross(xyz, offset)
     posed_means = moved[:3] + offset + w * twice + _cross(xyz, twice)
     real = w * v - _dot(xyz, uvw)
     posed_quats = torch.cat((real, w * uvw + v * xyz + _cross(xyz, uvw)))
     posed_scales = scales * moved[7, ..., None]
     return posed_means.movedim(0, -1).contiguous(), posed_quats.movedim(0, -1).contiguous(), posed_scales
+
+
+def rigid_turn(canonical_vertices: Tensor, posed_vertices: Tensor) -> Tensor:
+    """The rotation [...,4] (unit, wxyz) that best carries a mesh [V,3] to its posed self [...,V,3].
+
+    Closed form of Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987.
+    """
+    rest, posed = (v.detach().double() for v in (canonical_vertices, posed_vertices))
+    spread = (rest - rest.mean(-2, keepdim=True)).mT @ (posed - posed.mean(-2, keepdim=True))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in spread.unbind(-2))
+    rows = (
+        (xx + yy + zz, yz - zy, zx - xz, xy - yx),
+        (yz - zy, xx - yy - zz, xy + yx, zx + xz),
+        (zx - xz, xy + yx, yy - xx - zz, yz + zy),
+        (xy - yx, zx + xz, yz + zy, zz - xx - yy),
+    )
+    matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return torch.linalg.eigh(matrix).eigenvectors[..., -1].to(posed_vertices.dtype)
 
 
 def _interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
@@ -120,20 +138,18 @@ def _vertex_motion(canonical: Tensor, posed: Tensor, faces: Tensor) -> Tensor:
     turned_bitangent = cosine * posed_bitangent - sine * posed_tangent
     pairs = ((turned_tangent, tangent), (turned_bitangent, bitangent), (posed_normal, normal))
     quats = _matrix_to_quaternion(sum(after[:, None] * before[None] for after, before in pairs)) * area  # type: ignore[arg-type]
-    # A quaternion and its negative are one rotation: before adding, all are turned to the mesh's mean rotation,
-    # the main eigenvector of the summed outer products (Markley et al., Averaging Quaternions, 2007).
+    # A quaternion and its negative are one rotation; before sums, all lie on the side of the whole mesh's rotation.
     with torch.no_grad():
-        rows = quats.movedim(0, -2).double()
-        mean = torch.linalg.eigh(rows @ rows.mT).eigenvectors[..., -1].to(quats.dtype)
-        sign = torch.where(_dot(quats, mean.movedim(-1, 0)[..., None]) < 0, -1.0, 1.0)
+        towards = rigid_turn(canonical, posed)
+        sign = torch.where(_dot(quats, towards.movedim(-1, 0)[..., None]) < 0, -1.0, 1.0)
     parts = torch.cat((quats * sign, posed_area[None], area.expand_as(posed_area)[None])).movedim(-1, 0).contiguous()
     total = parts.new_zeros(canonical.shape[-2], *parts.shape[1:])
     for corner in range(3):
         total = total.index_add(0, faces[:, corner], parts)
     total = total.movedim(0, -1)
-    rotation = total[:4] * _dot(total[:4], total[:4]).clamp_min(_SMALL).rsqrt()
+    rotation = total[:4] * _dot(total[:4], total[:4]).clamp_min(SMALL).rsqrt()
     # The floors keep a vertex without triangles still, and the square root's gradient finite.
-    growth = ((total[4] + _SMALL) / (total[5] + _SMALL)).sqrt().clamp(*_SCALE_RANGE)
+    growth = ((total[4] + SMALL) / (total[5] + SMALL)).sqrt().clamp(*SCALE_RANGE)
     return torch.cat((rotation, growth[None])).movedim(0, -1)
 
 
@@ -146,9 +162,9 @@ def _edges(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 def _frames(first: Tensor, second: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
     """Tangent, bitangent and normal [3,...,F] and area [...,F] from two edges."""
     cross = _cross(first, second)
-    twice_area = _dot(cross, cross).clamp_min(_SMALL**2).sqrt()
+    twice_area = _dot(cross, cross).clamp_min(SMALL**2).sqrt()
     longest = torch.maximum(_dot(first, first), _dot(second, second))
-    sound = (twice_area > _FLAT * longest) & (twice_area > _SMALL)
+    sound = (twice_area > FLAT * longest) & (twice_area > SMALL)
     axes = torch.eye(3, dtype=first.dtype, device=first.device).view(3, 3, *(1,) * (first.ndim - 1))
     tangent = _unit(torch.where(sound, first, axes[0]))
     normal = _unit(torch.where(sound, cross, axes[2]))
@@ -171,13 +187,13 @@ def _in_plane_twist(
     from the triangle's mean turn, so that the result does not depend on the order of the corners.
     """
     length, x, y = _dot(rest[0], tangent), _dot(rest[1], tangent), _dot(rest[1], bitangent)
-    sound = (length.abs() > _SMALL) & (y.abs() > _SMALL)
+    sound = (length.abs() > SMALL) & (y.abs() > SMALL)
     safe_y = torch.where(sound, y, 1.0)
     stretch = _dot(moved[0], posed_tangent) / torch.where(sound, length, 1.0)
     shear = (_dot(moved[1], posed_tangent) - stretch * x) / safe_y
     along = torch.where(sound, stretch + _dot(moved[1], posed_bitangent) / safe_y, 1.0)
     across = torch.where(sound, -shear, 0.0)
-    scale = (along.square() + across.square() + _SMALL).rsqrt()
+    scale = (along.square() + across.square() + SMALL).rsqrt()
     return along * scale, across * scale
 
 
@@ -210,7 +226,7 @@ def _dot(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    return vectors * _dot(vectors, vectors).clamp_min(_SMALL**2).rsqrt()
+    return vectors * _dot(vectors, vectors).clamp_min(SMALL**2).rsqrt()
 
 
 def _cross(one: Tensor, other: Tensor) -> Tensor:

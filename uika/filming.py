@@ -1,0 +1,162 @@
+"""Many frames of one avatar as bytes, as fast as the processor allows: everything after the mesh runs in Dr.Jit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from uika.avatar import Avatar
+from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices
+from uika.head.binding import rigid_turn
+from uika.head.posing import rest_joints
+from uika.motion import Motion
+from uika.rendering import counted, motion_cameras
+
+_BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
+
+
+class Stage:
+    """An avatar ready to be filmed: its Gaussians, their binding and its own head, prepared once."""
+
+    def __init__(self, avatar: Avatar, head: HeadModel, background: Sequence[float] = (1.0, 1.0, 1.0)) -> None:
+        """Prepare.
+
+        Raises:
+            AvatarError: the head model is not the avatar's.
+            RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
+        """
+        from uika.head.rig import Rig
+
+        self.canonical = avatar.canonical_vertices(head)
+        self.rig = Rig.of(
+            avatar.means,
+            avatar.quats,
+            avatar.scales,
+            self.canonical,
+            head.faces,
+            avatar.triangle,
+            avatar.barycentric,
+        )
+        self._head = _personal(head, avatar.identity, self.canonical)
+        self._opacities, self._colors = _tensor(avatar.opacities), _tensor(avatar.colors)
+        self._background = _tensor(torch.tensor([list(background)]))
+
+    def meshes(self, params: HeadParameters) -> tuple[Tensor, Tensor]:
+        """Vertices [T,V,3] in metres and rigid turns [T,4] of T frames; the identity in `params` is ignored."""
+        own = params.replace(identity=params.expression[..., :0])
+        with torch.no_grad():
+            vertices = pose_vertices(self._head, own)
+            return vertices, rigid_turn(self.canonical, vertices)
+
+    def shoot(self, vertices: Tensor, turn: Tensor, camera: Camera) -> Any:
+        """Queue the work for one frame's bytes [H * W * 3], a Dr.Jit array; the image is not waited for.
+
+        Args:
+            vertices: [V,3] one of `meshes`.
+            turn: [4] its rigid turn.
+            camera: one camera.
+        """
+        import drjit as dr
+        from drjit.llvm import UInt8
+        from drjit.llvm.ad import Float, TensorXf
+
+        from drjit_splat.drjit_api import rasterization
+
+        count = self.rig.count
+        means, quats, scales = (
+            TensorXf(Float(array), (count, size))
+            for array, size in zip(self.rig.pose(vertices, turn), (3, 4, 3), strict=True)
+        )
+        picture, _ = rasterization(
+            means,
+            quats,
+            scales,
+            self._opacities,
+            self._colors,
+            _tensor(camera.viewmat[None]),
+            _tensor(camera.K[None]),
+            camera.width,
+            camera.height,
+            backgrounds=self._background,
+        )
+        values: Any = dr.detach(picture.array)
+        values = dr.select(values > 0, dr.select(values < 1, values, 1), 0)
+        image = UInt8(dr.round(255 * values))
+        dr.eval(image)
+        return image
+
+
+def film(
+    avatar: Avatar,
+    motion: Motion,
+    cameras: Camera | None = None,
+    head: HeadModel | None = None,
+    background: Sequence[float] = (1.0, 1.0, 1.0),
+    *,
+    size: int = 512,
+    progress: bool = False,
+) -> Iterator[NDArray[np.uint8]]:
+    """Render a motion frame by frame as bytes; what `frames` renders, without alpha and gradients.
+
+    Each frame is blended while the one before it is in the caller's hands.
+
+    Args:
+        avatar: the avatar.
+        motion: T frames.
+        cameras: one camera for all frames or T of them; None frames the head and follows the motion's camera path.
+        head: the head model; None loads the one that `uika.head.load_head` finds.
+        background: sRGB in [0,1].
+        size: side of the picture in pixels when `cameras` is None.
+        progress: whether to show a progress bar on stderr.
+
+    Yields:
+        [H,W,3] sRGB, rounded.
+
+    Raises:
+        AvatarError: the head model is not the avatar's.
+        RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
+    """
+    model = load_head() if head is None else head
+    stage = Stage(avatar, model, background)
+    path = motion_cameras(avatar, motion, size) if cameras is None else cameras
+    params = motion.parameters(avatar.identity)
+    waiting: Any = None
+    for index in counted(len(motion), progress):
+        place = index % _BLOCK
+        if place == 0:
+            vertices, turns = stage.meshes(params[index : index + _BLOCK])
+        queued = stage.shoot(vertices[place], turns[place], path[index])
+        if waiting is not None:
+            yield _picture(waiting, path)
+        waiting = queued
+    yield _picture(waiting, path)
+
+
+def _picture(image: Any, camera: Camera) -> NDArray[np.uint8]:
+    # The array may be a view of memory that Dr.Jit uses again.
+    pixels: NDArray[np.uint8] = np.array(image.numpy(), copy=True)
+    return pixels.reshape(camera.height, camera.width, 3)
+
+
+def _personal(head: HeadModel, identity: Tensor, canonical: Tensor) -> HeadModel:
+    """The head with one identity built in, and none to choose."""
+    neutral = HeadParameters.zeros(head).replace(identity=identity)
+    return replace(
+        head,
+        template=canonical,
+        joints=rest_joints(head, neutral),
+        identity_basis=head.identity_basis[:0],
+        joint_identity=head.joint_identity[:0],
+    )
+
+
+def _tensor(values: Tensor) -> Any:
+    from drjit.llvm.ad import Float, TensorXf
+
+    return TensorXf(Float(values.float().flatten().numpy()), tuple(values.shape))
