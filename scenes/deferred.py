@@ -8,23 +8,37 @@ direction of light for each vertex.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 
+from scenes.arrays import aligned, flat
 from scenes.people.glasses import Glasses, glasses_topology
-from scenes.shading import highlight, pixel_pattern, plane_points
+from scenes.shading import encode_srgb, highlight, pixel_pattern, plane_points
 from scenes.stage import Light, Stage, load_stage
 from scenes.variant import FAST_VARIANT, load_mitsuba
-from uika.head import Camera, HeadModel, project, vertex_normals
+from scenes.wave import Wave, waves
+from uika.head import Camera, HeadModel, vertex_normals
 
 LABELS = ("uv", "depth", "normal", "triangle")
+_CENTRE = (0.5, 0.5)
 _LIFT = 3e-4  # metres, from the vertex to the point that is lit: clear of its own triangles
 _RECORD = 16  # floats for each corner of the mesh
 _GLASSES_ROUGHNESS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class StoredView:
+    """A view as whole numbers, ready for a file."""
+
+    rgb: np.ndarray  # [H,W,3] uint8, sRGB in front of the backdrop
+    mask: np.ndarray  # [H,W] uint8
+    uv: np.ndarray  # [H,W,2] uint16, 0 for none and else 1 + round(uv * steps)
+    depth: np.ndarray  # [H,W] uint16, round(depth / unit), 0 for none
 
 
 def lit_stage(head: HeadModel, light: Light) -> Stage:
@@ -62,8 +76,10 @@ def gather_light(stage: Stage, points: torch.Tensor, normals: torch.Tensor, samp
 
     lane = dr.arange(mi.UInt32, len(points) * samples)
     vertex = lane // dr.opaque(mi.UInt32, samples)
-    point, normal = (mi.Point3f(np.ascontiguousarray(t.numpy().T)) for t in (points + _LIFT * normals, normals))
-    set_ = mi.Point2f(np.ascontiguousarray(plane_points(samples, seed).T))
+    point, normal = (
+        mi.Point3f(*(mi.Float(flat(axis)) for axis in t.numpy().T)) for t in (points + _LIFT * normals, normals)
+    )
+    set_ = mi.Point2f(*(mi.Float(flat(axis)) for axis in plane_points(samples, seed).T))
     hit = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
     hit.p, hit.n = dr.gather(mi.Point3f, point, vertex), mi.Normal3f(dr.gather(mi.Point3f, normal, vertex))
     place = dr.gather(mi.Point2f, set_, lane % dr.opaque(mi.UInt32, samples))
@@ -71,9 +87,9 @@ def gather_light(stage: Stage, points: torch.Tensor, normals: torch.Tensor, samp
     cosine = dr.maximum(dr.dot(sample.d, hit.n), 0.0)
     light = dr.select(sample.pdf > 0, weight * cosine * (dr.inv_pi / samples), 0.0)
     brightness = mi.luminance(light)
-    sums = [dr.block_sum(value, samples) for value in (*light, *(brightness * sample.d), brightness)]
-    dr.eval(sums)
-    columns = np.stack([np.array(value) for value in sums], -1)
+    values = [*light, *(brightness * sample.d), brightness]
+    dr.eval(values)  # together: each block sum alone would trace the shadow rays again
+    columns = np.stack([np.array(dr.block_sum(value, samples)) for value in values], -1)
     return np.concatenate((columns[:, :3], columns[:, 3:6] / np.maximum(columns[:, 6:], 1e-8)), -1)
 
 
@@ -109,16 +125,17 @@ class Shader:
         """
         mi = load_mitsuba()
         _require_fast(mi)
+        import drjit as dr
+
         stage.pose(head, vertices, None, glasses)
         self._scene, self._texture = stage.scene, texture
-        self._outline = vertices
         normals = vertex_normals(vertices, head.faces)
         points, source, faces, texcoords = vertices, stage.mesh.source, stage.mesh.faces, stage.mesh.texcoords
         self._shapes = [mi.ShapePtr(stage.shape("head"))]
-        self._head_faces, self._glasses_colour = len(faces), (0.0, 0.0, 0.0)
+        self._head_faces, self._glasses_colour = len(faces), mi.Color3f(0.0)
         if glasses is not None:
             self._shapes.append(mi.ShapePtr(stage.shape("glasses")))
-            self._glasses_colour = glasses.colour
+            self._glasses_colour = mi.Color3f(*glasses.colour)
             worn, more = torch.from_numpy(glasses.points), torch.from_numpy(glasses_topology()[1].astype(np.int64))
             normals = torch.cat((normals, vertex_normals(worn, more)))
             faces = np.concatenate((faces, more.numpy().astype(np.uint32) + len(source)))
@@ -126,19 +143,21 @@ class Shader:
             texcoords = np.concatenate((texcoords, np.zeros((len(worn), 2), np.float32)))
             points = torch.cat((points, worn))
         self._outline = points
+        # What differs between scenes and people must be data; as constants each would need a kernel of its own.
+        dr.make_opaque(self._shapes, self._glasses_colour)
         light = gather_light(stage, points, normals, samples, seed)
         light[:, :3] *= exposure
         corner = np.zeros((len(source), _RECORD), np.float32)
         corner[:, :11] = np.concatenate((texcoords, normals.numpy()[source], light[source]), -1)
-        self._corner = mi.Float(corner.ravel())
-        self._faces = mi.UInt32(np.ascontiguousarray(faces).ravel())
+        self._corner = mi.Float(flat(corner))
+        self._faces = mi.UInt32(flat(faces))
 
-    def view(self, camera: Camera, spp: int = 4, labels: Sequence[str] = ("uv",)) -> Mapping[str, np.ndarray]:
+    def view(self, camera: Camera, spp: int = 4, labels: Sequence[str] = ("uv",)) -> dict[str, np.ndarray]:
         """See the pose from one camera.
 
         Args:
             camera: one OpenCV camera.
-            spp: rays per pixel for colour and mask, on a regular pattern; 1, 4 or 16.
+            spp: rays per pixel for colour and mask, see `pixel_pattern`; 1, 4 or 16.
             labels: names out of `LABELS`, taken at pixel centres.
 
         Returns:
@@ -146,60 +165,73 @@ class Shader:
             labels: "uv" [H,W,2] v down (0 for none), "depth" [H,W] metres of camera z (0), "normal" [H,W,3] world
             space (0), "triangle" [H,W] int64 (-1).
         """
-        if spp not in (1, 4, 16) or not set(labels) <= set(LABELS):
-            raise ValueError(f"spp must be 1, 4 or 16 and labels out of {LABELS}, got {spp} and {labels}")
-        box = self._box(camera)
-        images = self._empty(camera, labels)
-        if box[2] > 0 and box[3] > 0:
-            self._colour(camera, box, spp, images)
-            self._labels(camera, box, labels, images)
+        import drjit as dr
+
+        if not set(labels) <= set(LABELS):
+            raise ValueError(f"labels must be out of {LABELS}, got {labels}")
+        (wave,) = waves([camera], self._outline)
+        layers = self._see(wave, spp, labels)
+        cover = layers["mask"][0]
+        layers["rgb"] = [value / dr.maximum(cover, 1e-3) for value in layers["rgb"]]
+        (images,) = wave.images(layers, {"triangle": np.int64(-1)})
         return images
 
-    def _box(self, camera: Camera) -> tuple[int, int, int, int]:
-        """x0, y0, width and height of the pixels that can see the head or its glasses."""
-        xy, z = project(self._outline.double(), camera)
-        if float(z.min()) <= 1e-3:
-            return 0, 0, camera.width, camera.height
-        limit = torch.tensor([camera.width, camera.height])
-        low = torch.minimum((xy.amin(0) - 1).floor().long().clamp_min(0), limit)
-        high = torch.minimum((xy.amax(0) + 1).ceil().long().clamp_min(0), limit)
-        (x0, y0), (width, height) = low.tolist(), (high - low).tolist()
-        return x0, y0, width, height
+    def stored_views(
+        self, cameras: Sequence[Camera], backdrops: Sequence[np.ndarray], steps: int, unit: float, spp: int = 4
+    ) -> Iterator[StoredView]:
+        """See the pose from several cameras in few launches.
 
-    def _empty(self, camera: Camera, labels: Sequence[str]) -> dict[str, np.ndarray]:
-        size = (camera.height, camera.width)
-        every: dict[str, np.ndarray] = {
-            "rgb": np.zeros((*size, 3), np.float32),
-            "mask": np.zeros(size, np.float32),
-            "uv": np.zeros((*size, 2), np.float32),
-            "depth": np.zeros(size, np.float32),
-            "normal": np.zeros((*size, 3), np.float32),
-            "triangle": np.full(size, -1, np.int64),
-        }
-        return {name: every[name] for name in ("rgb", "mask", *labels)}
-
-    def _cast(self, camera: Camera, box: tuple[int, int, int, int], offset: tuple[float, float]) -> tuple[Any, ...]:
-        """First hits of the rays through one point of each pixel of the box: rays, hits, shape seen, view axis."""
+        Args:
+            cameras: OpenCV cameras.
+            backdrops: for each camera the picture [H,W,3] uint8, sRGB, behind the head.
+            steps: of a stored coordinate, at most 65534.
+            unit: metres of one step of a stored depth.
+            spp: rays per pixel for colour and mask; 1, 4 or 16.
+        """
         mi = load_mitsuba()
         import drjit as dr
 
-        x0, y0, width, _ = (dr.opaque(mi.UInt32, value) for value in box)
-        pixel = dr.arange(mi.UInt32, box[2] * box[3])
-        x = mi.Float(x0 + pixel % width) + offset[0]
-        y = mi.Float(y0 + pixel // width) + offset[1]
-        K = camera.K.double().numpy()
-        fx, fy, cx, cy = (dr.opaque(mi.Float, float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-        rotation = camera.viewmat[:3, :3].double().numpy()
-        right, down, forward = (mi.Vector3f(*(dr.opaque(mi.Float, float(c)) for c in row)) for row in rotation)
-        direction = dr.normalize(right * ((x - cx) / fx) + down * ((y - cy) / fy) + forward)
-        origin = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in camera.position.double()))
-        ray = mi.Ray3f(origin, direction)
-        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        seen = [hit.is_valid() & (hit.shape == shape) for shape in self._shapes]
-        return ray, hit, seen, forward
+        done = 0
+        for wave in waves(cameras, self._outline):
+            behind = backdrops[done : done + len(wave.cameras)]
+            done += len(wave.cameras)
+            layers = self._see(wave, spp, ("uv", "depth", "triangle"))
+            cover = layers["mask"][0]
+            pixels = mi.UInt8(flat(wave.cut(behind)))
+            place = 3 * dr.arange(mi.UInt32, dr.width(cover))
+            colours = []
+            for channel, value in enumerate(layers["rgb"]):
+                far = mi.Float(dr.gather(mi.UInt8, pixels, place + channel))
+                near = 255 * encode_srgb(value / dr.maximum(cover, 1e-3))
+                colours.append(mi.UInt8(dr.fma(cover, near - far, far) + 0.5))
+            found = layers["triangle"][0] >= 0
+            stored = {
+                "rgb": colours,
+                "mask": [mi.UInt8(255 * cover + 0.5)],
+                "uv": [dr.select(found, mi.UInt32(dr.clip(value, 0, 1) * steps + 1.5), 0) for value in layers["uv"]],
+                "depth": [mi.UInt32(dr.clip(layers["depth"][0] / unit + 0.5, 0, 65535))],
+            }
+            none = np.uint16(0)
+            for images in wave.images(stored, {"rgb": behind, "uv": none, "depth": none}):
+                yield StoredView(**images)
 
-    def _mixed(self, hit: Any, seen: list[Any], columns: int) -> list[Any]:
-        """The first 2, 8 or 12 vertex values at the hits on what is seen: UV, normal, diffuse light, its direction."""
+    def _see(self, wave: Wave, spp: int, labels: Sequence[str]) -> dict[str, list[Any]]:
+        """Layers of the wave's pixels, not evaluated: "rgb" (linear, premultiplied), "mask" in [0,1] and the labels."""
+        mi = load_mitsuba()
+        sums = [mi.Float(0)] * 4
+        layers: dict[str, list[Any]] = {}
+        for offset in pixel_pattern(spp):
+            ray, forward = wave.rays(offset)
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+            seen = [hit.is_valid() & (hit.shape == shape) for shape in self._shapes]
+            values = self._mixed(hit, seen)
+            sums = [total + value for total, value in zip(sums, self._shade(ray, seen, values), strict=True)]
+            if offset == _CENTRE:
+                layers = _labels(labels, ray, forward, hit, seen[0], values)
+        return {"rgb": [value / spp for value in sums[:3]], "mask": [sums[3] / spp], **layers}
+
+    def _mixed(self, hit: Any, seen: list[Any]) -> list[Any]:
+        """Twelve vertex values at the hits on what is seen: UV, normal, diffuse light, its direction."""
         mi = load_mitsuba()
         import drjit as dr
         from drjit.llvm.ad import ArrayXf
@@ -209,41 +241,21 @@ class Shader:
             found, face = seen[0] | seen[1], face + dr.select(seen[1], self._head_faces, mi.UInt32(0))
         b1, b2 = hit.prim_uv.x, hit.prim_uv.y
         lanes = dr.width(face)
-        totals = [mi.Float(0)] * columns
+        totals = [mi.Float(0)] * 12
         for k, weight in enumerate((1 - b1 - b2, b1, b2)):
             corner = dr.gather(mi.UInt32, self._faces, 3 * face + k, found)
             # Values read in packets of a power of two cost one memory access each.
-            first = dr.gather(
-                ArrayXf, self._corner, corner * (_RECORD // min(columns, 8)), found, shape=(min(columns, 8), lanes)
-            )
-            values = [first[c] for c in range(min(columns, 8))]
-            if columns == 12:
-                rest = dr.gather(ArrayXf, self._corner, corner * (_RECORD // 4) + 2, found, shape=(4, lanes))
-                values += [rest[c] for c in range(4)]
+            first = dr.gather(ArrayXf, self._corner, corner * (_RECORD // 8), found, shape=(8, lanes))
+            rest = dr.gather(ArrayXf, self._corner, corner * (_RECORD // 4) + 2, found, shape=(4, lanes))
+            values = [*(first[c] for c in range(8)), *(rest[c] for c in range(4))]
             totals = [dr.fma(weight, value, total) for value, total in zip(values, totals, strict=True)]
         return totals
 
-    def _colour(self, camera: Camera, box: tuple[int, int, int, int], spp: int, images: dict[str, np.ndarray]) -> None:
+    def _shade(self, ray: Any, seen: list[Any], values: list[Any]) -> list[Any]:
+        """Linear colour and coverage, 0 where nothing is seen."""
         mi = load_mitsuba()
         import drjit as dr
 
-        sums = [mi.Float(0)] * 4
-        for offset in pixel_pattern(spp):
-            sums = [total + value for total, value in zip(sums, self._sample(camera, box, offset), strict=True)]
-        dr.eval(sums)
-        x0, y0, width, height = box
-        mask = np.array(sums[3]).reshape(height, width)
-        rgb = np.stack([np.array(value) for value in sums[:3]], -1).reshape(height, width, 3)
-        images["rgb"][y0 : y0 + height, x0 : x0 + width] = rgb / np.maximum(mask, 1)[..., None]
-        images["mask"][y0 : y0 + height, x0 : x0 + width] = mask / spp
-
-    def _sample(self, camera: Camera, box: tuple[int, int, int, int], offset: tuple[float, float]) -> list[Any]:
-        """Linear colour and coverage at one point of each pixel of the box."""
-        mi = load_mitsuba()
-        import drjit as dr
-
-        ray, hit, seen, _ = self._cast(camera, box, offset)
-        values = self._mixed(hit, seen, 12)
         normal, diffuse, mean = mi.Vector3f(values[2:5]), mi.Color3f(values[5:8]), mi.Vector3f(values[8:11])
         *albedo, rough = self._texture.eval(mi.Point2f(values[:2]), seen[0])
         found = seen[0]
@@ -254,32 +266,23 @@ class Shader:
         colour = mi.Color3f(albedo) * diffuse + highlight(normal, -ray.d, mean, diffuse, rough)
         return [dr.select(found, value, 0.0) for value in (*colour, mi.Float(1))]
 
-    def _labels(
-        self, camera: Camera, box: tuple[int, int, int, int], labels: Sequence[str], images: dict[str, np.ndarray]
-    ) -> None:
-        if not labels:
-            return
-        mi = load_mitsuba()
-        import drjit as dr
 
-        ray, hit, seen, forward = self._cast(camera, box, (0.5, 0.5))
-        seen = seen[:1]
-        found = seen[0]
-        results: dict[str, list[Any]] = {}
-        if "uv" in labels:
-            results["uv"] = [dr.select(found, value, 0.0) for value in self._mixed(hit, seen, 2)]
-        if "depth" in labels:
-            results["depth"] = [dr.select(found, hit.t * dr.dot(ray.d, forward), 0.0)]
-        if "normal" in labels:
-            unit = dr.normalize(mi.Vector3f(self._mixed(hit, seen, 8)[2:5]))
-            results["normal"] = [dr.select(found, value, 0.0) for value in unit]
-        if "triangle" in labels:
-            results["triangle"] = [dr.select(found, mi.Int32(hit.prim_index), -1)]
-        dr.eval(list(results.values()))
-        x0, y0, width, height = box
-        for name, values in results.items():
-            layers = [np.array(value).reshape(height, width) for value in values]
-            images[name][y0 : y0 + height, x0 : x0 + width] = layers[0] if len(layers) == 1 else np.stack(layers, -1)
+def _labels(
+    names: Sequence[str], ray: Any, forward: Any, hit: Any, found: Any, values: list[Any]
+) -> dict[str, list[Any]]:
+    mi = load_mitsuba()
+    import drjit as dr
+
+    layers: dict[str, list[Any]] = {}
+    if "uv" in names:
+        layers["uv"] = [dr.select(found, value, 0.0) for value in values[:2]]
+    if "depth" in names:
+        layers["depth"] = [dr.select(found, hit.t * dr.dot(ray.d, forward), 0.0)]
+    if "normal" in names:
+        layers["normal"] = [dr.select(found, value, 0.0) for value in dr.normalize(mi.Vector3f(values[2:5]))]
+    if "triangle" in names:
+        layers["triangle"] = [dr.select(found, mi.Int32(hit.prim_index), -1)]
+    return layers
 
 
 def as_texture(albedo: np.ndarray, roughness: np.ndarray) -> Any:
@@ -289,7 +292,7 @@ def as_texture(albedo: np.ndarray, roughness: np.ndarray) -> Any:
     import drjit as dr
 
     layers = np.concatenate((albedo, roughness[..., None]), -1).astype(np.float32)
-    return mi.Texture2f(mi.TensorXf(np.ascontiguousarray(layers)), wrap_mode=dr.WrapMode.Clamp)
+    return mi.Texture2f(mi.TensorXf(aligned(layers)), wrap_mode=dr.WrapMode.Clamp)
 
 
 def _require_fast(mi: Any) -> None:

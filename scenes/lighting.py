@@ -43,7 +43,7 @@ def sample_lighting(random: np.random.Generator) -> Lighting:
         side = random.choice((-1.0, 1.0))
         values["room.radiance.value"] = _grey(random.uniform(0.05, 0.3))
         values["key.emitter.radiance.value"] = _warm(random, 100.0)
-        values["key.to_world"] = _lamp(random, (side * 45, side * 110), (5, 50), random.uniform(0.1, 0.2))
+        values["key.to_world"] = _lamp(random, (45, 110), (5, 50), random.uniform(0.1, 0.2), side)
     else:
         values["room.radiance.value"] = _grey(random.uniform(0.15, 0.5))
         values["key.emitter.radiance.value"] = _warm(random, 7.0)
@@ -97,10 +97,17 @@ def _grey(radiance: float) -> np.ndarray:
 
 
 def _lamp(
-    random: np.random.Generator, yaw: tuple[float, float], pitch: tuple[float, float], half_size: float
+    random: np.random.Generator,
+    yaw: tuple[float, float],
+    pitch: tuple[float, float],
+    half_size: float,
+    side: float = 1.0,
 ) -> np.ndarray:
-    """Transform [4,4] of a square lamp 2.4 m away that faces the head, at random angles within the ranges (degrees)."""
-    a, b = np.deg2rad(random.uniform(*yaw)), np.deg2rad(random.uniform(*pitch))
+    """Transform [4,4] of a square lamp 2.4 m away that faces the head, at random angles within the ranges (degrees).
+
+    A `side` of -1 puts it on the head's right.
+    """
+    a, b = np.deg2rad(side * random.uniform(*yaw)), np.deg2rad(random.uniform(*pitch))
     back = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     result = np.eye(4)

@@ -1,4 +1,4 @@
-"""The highlight model and the sample patterns of `scenes.deferred`."""
+"""The highlight model, transfer curve and sample patterns of `scenes.deferred`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+# Samples per pixel -> rings around the centre: points, radius in pixels and degrees of the first point. Their spread is
+# about that of a pixel's whole area.
+_RINGS = {1: (), 4: ((3, 0.43, 15.0),), 16: ((5, 0.27, 10.0), (10, 0.46, 4.0))}
 _SPECULAR = 0.035  # reflectance of skin and hair at normal incidence
 
 
@@ -35,12 +38,29 @@ def highlight(normal: Any, view: Any, mean: Any, diffuse: Any, rough: Any) -> An
     return diffuse * (directness * dr.pi * 0.25 * lobe * masking * fresnel + (1 - directness) * even)
 
 
+def encode_srgb(value: Any) -> Any:
+    """Linear values as sRGB in [0,1], on the device (IEC 61966-2-1)."""
+    import drjit as dr
+
+    v = dr.clip(value, 0.0, 1.0)
+    return dr.select(v <= 0.0031308, 12.92 * v, 1.055 * dr.power(v, 1 / 2.4) - 0.055)
+
+
 def pixel_pattern(spp: int) -> list[tuple[float, float]]:
-    """Points of a pixel: a square grid turned so that each sits in a row and a column of its own."""
-    side = round(spp**0.5)
-    return [
-        ((u + (v + 0.5) / side) / side, (v + (side - u - 0.5) / side) / side) for v in range(side) for u in range(side)
-    ]
+    """Points of a pixel: its centre, where labels are taken, and rings around it.
+
+    The points' mean is the centre and no two share a row or a column.
+
+    Raises:
+        ValueError: there is no pattern of that many points.
+    """
+    if spp not in _RINGS:
+        raise ValueError(f"spp must be one of {tuple(_RINGS)}, not {spp}")
+    points = [(0.5, 0.5)]
+    for count, radius, turn in _RINGS[spp]:
+        angles = np.deg2rad(turn) + 2 * np.pi * np.arange(count) / count
+        points += [(0.5 + radius * float(np.cos(a)), 0.5 + radius * float(np.sin(a))) for a in angles]
+    return points
 
 
 def plane_points(count: int, seed: int) -> np.ndarray:

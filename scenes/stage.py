@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from scenes.arrays import aligned
 from scenes.geometry import SeamMesh, cut_seams
 from scenes.people.glasses import Glasses, glasses_topology
 from scenes.variant import load_mitsuba, single_threaded
@@ -81,15 +82,16 @@ class Stage:
         """Set head vertices [V,3] in metres and glasses, shaded for a viewer at `eye` [3], and apply all changes."""
         bent = eye is not None and "head.vertex_normals" in self.params
         normals = self.mesh.normals(vertices, head.faces, eye) if bent and eye is not None else None
+        self._set("head.vertex_positions", self.mesh.positions(vertices))
+        if normals is not None:
+            self._set("head.vertex_normals", normals)
+        self._place_glasses(vertices, glasses)
+        with single_threaded():
+            self.params.update()
         # Mitsuba tells distant lamps the size of the scene one update late; they aim shadow rays with it, and a picture
         # must not depend on what stood here before.
-        for _ in range(2):
-            self._set("head.vertex_positions", self.mesh.positions(vertices))
-            if normals is not None:
-                self._set("head.vertex_normals", normals)
-            self._place_glasses(vertices, glasses)
-            with single_threaded():
-                self.params.update()
+        for emitter in self.scene.emitters():
+            emitter.set_scene(self.scene)
 
     def _place_glasses(self, vertices: torch.Tensor, glasses: Glasses | None) -> None:
         if "glasses.vertex_positions" in self.params:
@@ -128,7 +130,7 @@ class Stage:
 
     def _set(self, key: str, array: np.ndarray) -> None:
         kind = type(self.params[key])
-        values = np.ascontiguousarray(array, np.float32)
+        values = aligned(array.astype(np.float32))
         self.params[key] = kind(values if kind.__name__.startswith("Tensor") else values.ravel())
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
+from scenes.people.bleed import bleed
 from scenes.people.fields import Fields, atlas_fields
 from scenes.people.hair import beard_cover, hair_strands, hairline
 from scenes.people.noise import fractal_noise, smoothstep, value_noise
@@ -19,7 +19,6 @@ _BLOOD = (0.06, 0.55, 0.42)
 _SCLERA = (0.66, 0.62, 0.6)
 _TEETH = (0.68, 0.62, 0.52)
 _GUMS = (0.34, 0.1, 0.09)
-_BLEED = 6  # texels painted beyond the edges of the charts
 _NOSE, _CHEEK = (0.0, -0.033, 0.078), (0.045, -0.03, 0.048)
 _FOLD = ((0.017, -0.036, 0.062), (0.031, -0.066, 0.05))  # from the wing of the nose past the corner of the mouth
 
@@ -56,7 +55,7 @@ def paint(person: Person, head: HeadModel, size: int = 1024) -> tuple[np.ndarray
         if len(index):
             albedo[index], rough[index] = layer(fields.select(index), person, random, albedo[index], rough[index])
     values = fields.binding.to_map(torch.cat((albedo, rough[:, None]), -1))
-    spread = _spread(values, fields.binding.valid)
+    spread = bleed(values, head, size)
     return spread[:3].permute(1, 2, 0).contiguous().numpy(), spread[3].numpy()
 
 
@@ -224,15 +223,3 @@ def _blob(points: Tensor, place: tuple[float, float, float], reach: float) -> Te
     """A soft spot around a place and its mirror image."""
     folded = torch.stack((points[:, 0].abs(), points[:, 1], points[:, 2]), -1)
     return torch.exp(-(((folded - torch.tensor(place)).norm(dim=-1) / reach) ** 2))
-
-
-def _spread(values: Tensor, valid: Tensor) -> Tensor:
-    """Carry the charts' border values [C,S,S] outwards, so that interpolation meets no background."""
-    cover = valid[None].float()
-    for _ in range(_BLEED):
-        total = avg_pool2d((values * cover)[None], 3, 1, 1)[0]
-        weight = avg_pool2d(cover[None], 3, 1, 1)[0]
-        fresh = (cover == 0) & (weight > 0)
-        values = torch.where(fresh, total / weight.clamp_min(1e-6), values)
-        cover = torch.where(fresh, torch.ones_like(cover), cover)
-    return values

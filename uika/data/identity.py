@@ -7,19 +7,22 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from uika.data.encode import encode_colour, encode_depth, encode_uv
+from uika.data.encode import DEPTH_UNIT, UV_STEPS, encode_pixels, encode_uv
 from uika.data.performance import perform, place_camera, viewpoints
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, shaped_vertices, vertex_normals
+
+if TYPE_CHECKING:
+    from scenes.deferred import StoredView
 
 _SPP = 4
 _LIGHT_SAMPLES = (32, 64)  # for each vertex, in images below and from 256 pixels on
 _ENCODERS = 2
-_WAITING = 12  # images that may wait for an encoder
+_WAITING = 9  # views that may wait for an encoder
 # One stream of random numbers for each purpose, so that none depends on how often another was asked.
 _STREAMS = {"person": 0, "motion": 1, "light": 2, "camera": 3, "backdrop": 4, "samples": 5}
 
@@ -32,7 +35,6 @@ def generate_identity(
     All depends on the arguments alone. The folder holds `transforms.json` and parameter files as VHAP exports them, and
     beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`).
     """
-    from scenes.colour import linear_to_srgb
     from scenes.deferred import Shader, as_texture, lit_stage
     from scenes.lighting import backdrop, sample_lighting
     from scenes.people import paint, sample_person, wear_glasses
@@ -53,11 +55,14 @@ def generate_identity(
         place_camera(view, size, _random(seed, identity, "camera", index))
         for index, view in enumerate(viewpoints(views))
     ]
-    backdrops = [backdrop(_random(seed, identity, "backdrop", index), size) for index in range(views)]
+    backdrops = [
+        (255 * backdrop(_random(seed, identity, "backdrop", index), size) + 0.5).astype(np.uint8)
+        for index in range(views)
+    ]
     yield "canonical_flame_param.npz", _npz(shape=person.shape[None], static_offset=offset[None])
     posed = pose_vertices(head, params, offset)
     with ThreadPoolExecutor(_ENCODERS) as pool:
-        waiting: deque[tuple[str, Future[bytes]]] = deque()
+        waiting: deque[Future[list[tuple[str, bytes]]]] = deque()
         for frame in range(frames):
             yield f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))
             glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
@@ -71,21 +76,13 @@ def generate_identity(
                 samples=_LIGHT_SAMPLES[size >= 256],
                 seed=samples,
             )
-            for view, camera in enumerate(cameras):
-                seen = shader.view(camera, _SPP, ("uv", "depth", "triangle"))
-                alpha = seen["mask"][..., None]
-                image = linear_to_srgb(seen["rgb"]) * alpha + backdrops[view] * (1 - alpha)
-                name = f"{frame:05d}_{view:02d}.png"
-                waiting.append((f"images/{name}", pool.submit(encode_colour, image)))
-                waiting.append((f"fg_masks/{name}", pool.submit(encode_colour, seen["mask"])))
-                waiting.append((f"uv/{name}", pool.submit(encode_uv, seen["uv"], seen["triangle"] >= 0)))
-                waiting.append((f"depth/{name}", pool.submit(encode_depth, seen["depth"])))
-                while len(waiting) > _WAITING:
-                    path, result = waiting.popleft()
-                    yield path, result.result()
+            seen = shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT, _SPP)
+            for view, images in enumerate(seen):
+                waiting.append(pool.submit(_encode, f"{frame:05d}_{view:02d}.png", images))
+                while len(waiting) > max(views, _WAITING):
+                    yield from waiting.popleft().result()
         while waiting:
-            path, result = waiting.popleft()
-            yield path, result.result()
+            yield from waiting.popleft().result()
     description = {
         "head_id": head.id,
         "person": {"cut": person.cut, "beard": person.beard, "glasses": person.glasses is not None},
@@ -97,7 +94,16 @@ def generate_identity(
 
 def texture_size(size: int) -> int:
     """Side of the atlas in texels that suits images of `size` pixels."""
-    return min(max(256, 2 * size), 1024)
+    return min(max(256, 3 * size // 2), 1024)
+
+
+def _encode(name: str, images: StoredView) -> list[tuple[str, bytes]]:
+    return [
+        (f"images/{name}", encode_pixels(images.rgb)),
+        (f"fg_masks/{name}", encode_pixels(images.mask)),
+        (f"uv/{name}", encode_uv(images.uv)),
+        (f"depth/{name}", encode_pixels(images.depth)),
+    ]
 
 
 def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.Generator:
