@@ -1,18 +1,19 @@
 """Run time against error: `OMP_WAIT_POLICY=passive python -m benchmarks.rasterizer_pareto`.
 
-Forward + backward at 130k @ 512 x 512 under different thresholds, exponentials and tile tests, in turns. Errors are
-against the float64 image of every pair above 1e-7 that never stops a pixel.
+Forward + backward on three scenes under different thresholds, exponentials and tile tests, in turns. Errors are against
+the float64 image of every pair above 1e-7 that never stops a pixel.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 import torch
 
 from benchmarks import pair_oracle
 from benchmarks.rasterizer_common import RESULTS, interleaved, markdown, save
-from benchmarks.splat_scenes import head_scene
+from benchmarks.splat_scenes import NAMES, named_scene
 from drjit_splat import Options, rasterization
 
 CHOICES: dict[str, dict[str, Options]] = {
@@ -41,43 +42,41 @@ CHOICES: dict[str, dict[str, Options]] = {
 }
 
 
-def figure(rows: list[dict[str, object]]) -> None:
-    """Time against RMSE, one colour for each kind of setting."""
+def figure(rows: list[dict[str, object]], scenes: Sequence[str]) -> None:
+    """Time against RMSE, a panel for each scene, one colour for each kind of setting."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    drawing, axes = pyplot.subplots(figsize=(9, 5.5), dpi=110)
-    for group in CHOICES:
-        points = [r for r in rows if r["group"] == group]
-        axes.scatter(
-            [float(str(r["RMSE"])) for r in points], [float(str(r["f + b ms"])) for r in points], s=42, label=group
-        )
-    placed: list[tuple[float, float]] = []
-    for row in sorted(rows, key=lambda r: float(str(r["f + b ms"]))):
-        x, y = float(str(row["RMSE"])), float(str(row["f + b ms"]))
-        clash = sum(0.6 < x / a < 1.7 and abs(y / b - 1) < 0.06 for a, b in placed)
-        placed.append((x, y))
-        axes.annotate(str(row["setting"]), (x, y), xytext=(7, 4 + 11 * clash), textcoords="offset points", fontsize=8)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel("RMSE against the image without skips")
-    axes.set_ylabel("forward + backward, ms")
-    axes.set_title("130,000 splats on 512 x 512 pixels")
-    axes.grid(True, which="both", alpha=0.25)
-    axes.legend(fontsize=8)
+    drawing, panels = pyplot.subplots(1, len(scenes), figsize=(7.5 * len(scenes), 5.5), dpi=100, squeeze=False)
+    for axes, scene in zip(panels[0], scenes, strict=True):
+        here = [row for row in rows if row["scene"] == scene]
+        for group in CHOICES:
+            points = [row for row in here if row["group"] == group]
+            x, y = ([float(str(row[key])) for row in points] for key in ("RMSE", "f + b ms"))
+            axes.scatter(x, y, s=42, label=group)
+        placed: list[tuple[float, float]] = []
+        for row in sorted(here, key=lambda r: float(str(r["f + b ms"]))):
+            x, y = float(str(row["RMSE"])), float(str(row["f + b ms"]))
+            clash = sum(0.6 < x / a < 1.7 and abs(y / b - 1) < 0.06 for a, b in placed)
+            placed.append((x, y))
+            place = (7, 4 + 11 * clash)
+            axes.annotate(str(row["setting"]), (x, y), xytext=place, textcoords="offset points", fontsize=8)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("RMSE against the image without skips")
+        axes.set_ylabel("forward + backward, ms")
+        axes.set_title(scene)
+        axes.grid(True, which="both", alpha=0.25)
+        axes.legend(fontsize=8)
     drawing.tight_layout()
     drawing.savefig(RESULTS / "rasterizer_pareto.png")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--count", type=int, default=130_000)
-    parser.add_argument("--size", type=int, default=512)
-    arguments = parser.parse_args()
-    scene = head_scene(arguments.count, arguments.size)
+def measure(name: str, repeats: int) -> list[dict[str, object]]:
+    """A row for every setting on one scene."""
+    scene = named_scene(name)
     leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
     weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -88,19 +87,20 @@ def main() -> None:
         image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size, options=options)[0][0]
         torch.autograd.grad(image, leaves, grad_outputs=weight)
 
-    settings = {(group, name): options for group, found in CHOICES.items() for name, options in found.items()}
-    runs = {f"{group}: {name}": (lambda o=options: both(o)) for (group, name), options in settings.items()}
-    times = interleaved(runs, dict.fromkeys(runs, arguments.repeats))
+    settings = {(group, label): options for group, found in CHOICES.items() for label, options in found.items()}
+    runs = {f"{group}: {label}": (lambda o=options: both(o)) for (group, label), options in settings.items()}
+    times = interleaved(runs, dict.fromkeys(runs, repeats))
     rows: list[dict[str, object]] = []
-    for (group, name), options in settings.items():
+    for (group, label), options in settings.items():
         with torch.no_grad():
             image, _, meta = rasterization(*scene.tensors, scene.size, scene.size, options=options)
         error = (image[0] - exact).abs()
-        timing = times[f"{group}: {name}"]
+        timing = times[f"{group}: {label}"]
         rows.append(
             {
+                "scene": name,
                 "group": group,
-                "setting": name,
+                "setting": label,
                 "f + b ms": f"{timing.best:.1f}",
                 "median": f"{timing.median:.1f}",
                 "CPU ms": f"{timing.cpu:.0f}",
@@ -109,12 +109,18 @@ def main() -> None:
                 "pairs": meta["n_pairs"][0],
             }
         )
-    text = (
-        f"{arguments.count} splats, {arguments.size} x {arguments.size}, forward + backward, minimum and median ms\n\n"
-        f"{markdown(rows)}\n\n![](rasterizer_pareto.png)"
-    )
+    return rows
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=12)
+    parser.add_argument("--scenes", nargs="+", choices=NAMES, default=["30k", "130k", "avatar"])
+    arguments = parser.parse_args(argv)
+    rows = [row for name in arguments.scenes for row in measure(name, arguments.repeats)]
+    text = f"Forward + backward, minimum and median ms; `(default)` marks the default.\n\n{markdown(rows)}"
     save("rasterizer_pareto", "Rasterizer: run time against error", text, {"rows": rows})
-    figure(rows)
+    figure(rows, arguments.scenes)
 
 
 if __name__ == "__main__":
