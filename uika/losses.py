@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 _WINDOW, _SIGMA = 11, 1.5
+SSIM_REACH = _WINDOW // 2  # pixels beside one that its similarity depends on
 _C1, _C2 = 0.01**2, 0.03**2
 _MIN_SIDE = 8  # pixels, of the coarsest level that gradients are compared on
 _SURE = 1e-6
@@ -95,8 +96,8 @@ def variation(maps: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor) -> Tensor:
-    place = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - _WINDOW // 2
+    place = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - SSIM_REACH
     window = (-place.square() / (2 * _SIGMA**2)).exp()
     window = (window / window.sum()).expand(images.shape[1], 1, 1, _WINDOW)
-    across = functional.conv2d(images, window, padding=(0, _WINDOW // 2), groups=images.shape[1])
-    return functional.conv2d(across, window.mT, padding=(_WINDOW // 2, 0), groups=images.shape[1])
+    across = functional.conv2d(images, window, padding=(0, SSIM_REACH), groups=images.shape[1])
+    return functional.conv2d(across, window.mT, padding=(SSIM_REACH, 0), groups=images.shape[1])

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,6 +40,14 @@ class Report:
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+class LoadedModel(NamedTuple):
+    """A network, its name for the avatar's provenance, and whether it is run or only says what the photos show."""
+
+    network: Reconstructor
+    name: str
+    run: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +87,12 @@ def reconstruct(
     """
     if not 1 <= len(photos) <= MAX_PHOTOS:
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
-    from uika.correspondence import fit_photos, pixel_uv
-    from uika.feeding import model_inputs
+    from uika.correspondence import fit_photos
     from uika.photo import head_matte, prepare
 
     report = Report() if report is None else report
     with report.stage("model"):
-        network, name = _network(model)
+        loaded = load_model(model)
         head = load_head() if head is None else head
     with report.stage("photos"):
         prepared = sorted((prepare(path) for path in photos), key=lambda photo: photo.sha256)
@@ -93,17 +100,46 @@ def reconstruct(
     with report.stage("fit"):
         pictures = [photo.image for photo in prepared] if refine else None
         fit = fit_photos(prepared, head, hair, images=pictures)
+    images = torch.stack([photo.image for photo in prepared])
+    mattes = torch.stack([photo.matte for photo in prepared])
+    digests = [photo.sha256 for photo in prepared]
+    avatar = avatar_from_fit(loaded, head, fit, images, mattes, digests, report)
+    return Reconstruction(avatar, tuple(prepared), fit, report)
+
+
+@torch.no_grad()
+def avatar_from_fit(
+    loaded: LoadedModel,
+    head: HeadModel,
+    fit: Fit,
+    images: Tensor,
+    mattes: Tensor,
+    digests: Sequence[str],
+    report: Report,
+) -> Avatar:
+    """Make an avatar from photos whose head and cameras are known.
+
+    Args:
+        loaded: the model.
+        head: the head model.
+        fit: heads and cameras of N photos.
+        images: [N,3,S,S] sRGB in [0,1] on one plain colour.
+        mattes: [N,S,S] in [0,1].
+        digests: what identifies the photos, for the avatar's provenance.
+        report: gets times and counts.
+    """
+    from uika.correspondence import pixel_uv
+    from uika.feeding import model_inputs
+
     with report.stage("correspondence"):
-        images = torch.stack([photo.image for photo in prepared])
-        mattes = torch.stack([photo.matte for photo in prepared])
         uv, valid, weight = pixel_uv(fit, head, mattes)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
-    with report.stage("reconstruction"), torch.no_grad():
-        identity = fit.parameters.identity[0]
-        inputs, binding = model_inputs(network.config, head, identity, fit.static_offset, images, mattes, uv, weight)
-        means, quats, scales, opacities, colors, counts = _gaussians(network, inputs, run=model != "none")
+    with report.stage("reconstruction"):
+        identity, config = fit.parameters.identity[0], loaded.network.config
+        inputs, binding = model_inputs(config, head, identity, fit.static_offset, images, mattes, uv, weight)
+        means, quats, scales, opacities, colors, counts = _gaussians(loaded, inputs)
     report.counts.update(counts)
-    avatar = Avatar(
+    return Avatar(
         head_id=head.id,
         identity=identity.clone(),
         static_offset=fit.static_offset,
@@ -116,11 +152,10 @@ def reconstruct(
         barycentric=binding.barycentric,
         provenance={
             "program": f"uika-drjit {__version__}",
-            "model": name,
-            "photos": " ".join(photo.sha256 for photo in prepared),
+            "model": loaded.name,
+            "photos": " ".join(digests),
         },
     )
-    return Reconstruction(avatar, tuple(prepared), fit, report)
 
 
 def check_model(model: str | Path) -> None:
@@ -133,21 +168,29 @@ def check_model(model: str | Path) -> None:
         raise UikaError(f"{model}: no such model; use 'tiny', 'none' or the path of a trained model (.safetensors)")
 
 
-def _network(model: str | Path) -> tuple[Reconstructor, str]:
+def load_model(model: str | Path) -> LoadedModel:
+    """The model of a name or file that `reconstruct` takes.
+
+    Raises:
+        ValueError: the name or file cannot be used.
+    """
     from uika.model import build, load_checkpoint
 
     check_model(model)
-    if str(model) in ("tiny", "none"):
-        return build("tiny").eval(), f"{model} (untrained)" if str(model) == "tiny" else "none"
+    if str(model) == "tiny":
+        return LoadedModel(build("tiny").eval(), "tiny (untrained)", True)
+    if str(model) == "none":
+        return LoadedModel(build("tiny").eval(), "none", False)
     network = load_checkpoint(model)
-    return network, f"{network.config.name} ({Path(model).name})"
+    return LoadedModel(network, f"{network.config.name} ({Path(model).name})", True)
 
 
 def _gaussians(
-    network: Reconstructor, inputs: ModelInputs, run: bool
+    loaded: LoadedModel, inputs: ModelInputs
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
     """Means, quats, scales, opacities, colours (batch first) and counts, from the network or from the surface alone."""
-    if run:
+    network = loaded.network
+    if loaded.run:
         result = network(*inputs)
         counts = dict(result.report)
         return result.means, result.quats, result.scales, result.opacities, result.colors, counts

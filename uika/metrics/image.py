@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from uika.losses import SSIM_REACH, ssim_map
+
 
 def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB for values in [0,1]: -10 log10 of the mean squared error.
@@ -17,15 +19,31 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     Raises:
         ValueError: shapes differ or no pixel counts.
     """
-    if image.shape != reference.shape:
-        raise ValueError(
-            f"image and reference must have one shape, got {list(image.shape)} and {list(reference.shape)}"
-        )
+    check_pair(image, reference)
     square = (image.double() - reference.double()).square()
-    chosen = square if mask is None else square[mask]
-    if chosen.numel() == 0:
-        raise ValueError("mask: no pixel counts")
-    return float(-10.0 * torch.log10(chosen.mean().clamp_min(1e-12)))
+    return float(-10.0 * torch.log10(chosen(square, mask).mean().clamp_min(1e-12)))
+
+
+def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
+    """Structural similarity (Wang et al. 2004) of pictures in [0,1], the mean over pixels and channels.
+
+    The Gaussian window has sigma 1.5 and 11 pixels; pixels whose window leaves the picture do not count.
+
+    Args:
+        image: [H,W,C] picture.
+        reference: [H,W,C] truth.
+        mask: [H,W] bool, the pixels that count; None counts all.
+
+    Raises:
+        ValueError: shapes differ, the picture is smaller than the window, or no pixel counts.
+    """
+    check_pair(image, reference)
+    if min(image.shape[:2]) <= 2 * SSIM_REACH:
+        raise ValueError(f"image: ssim needs more than {2 * SSIM_REACH} pixels a side, got {list(image.shape[:2])}")
+    first, second = (picture.double().permute(2, 0, 1)[None] for picture in (image, reference))
+    inner = slice(SSIM_REACH, -SSIM_REACH)
+    likeness = ssim_map(first, second)[0].permute(1, 2, 0)[inner, inner]
+    return float(chosen(likeness, None if mask is None else mask[inner, inner]).mean())
 
 
 def mask_iou(first: Tensor, second: Tensor, threshold: float = 0.5) -> float:
@@ -33,3 +51,27 @@ def mask_iou(first: Tensor, second: Tensor, threshold: float = 0.5) -> float:
     a, b = first >= threshold, second >= threshold
     union = int((a | b).sum())
     return float((a & b).sum() / union) if union else 1.0
+
+
+def check_pair(image: Tensor, reference: Tensor) -> None:
+    """Make sure that two pictures [H,W,C] can be compared.
+
+    Raises:
+        ValueError: they differ in shape or are no pictures.
+    """
+    if image.shape != reference.shape or image.ndim != 3:
+        raise ValueError(
+            f"image and reference must be [H,W,C] of one shape, got {list(image.shape)} and {list(reference.shape)}"
+        )
+
+
+def chosen(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Values [H,W,...] of the pixels in a mask [H,W] bool, or all of them.
+
+    Raises:
+        ValueError: no pixel is in the mask.
+    """
+    picked = values if mask is None else values[mask]
+    if picked.numel() == 0:
+        raise ValueError("mask: no pixel counts")
+    return picked
