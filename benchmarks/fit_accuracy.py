@@ -2,7 +2,8 @@
 
 Random people (identity, skin, expression in each photo) are rendered by Mitsuba from random sides; landmarks are the
 true ones with 1 px of noise, or found by the face mesh detector (`--detector`). Errors are against the rendered mesh.
-`python -m benchmarks.fit_accuracy [--people 50] [--refined 12]`, writes `benchmarks/results/fit_accuracy.{json,md}`.
+`python -m benchmarks.fit_accuracy [--people 50] [--refined 12] [--resume FOLDER]` writes
+`benchmarks/results/fit_accuracy.{json,md}`, with `--detector` `fit_accuracy_detector.{json,md}`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from uika.correspondence import Fit, LandmarkFit, fit_landmarks, pixel_uv
 from uika.correspondence.refine import refine_landmark_fit
+from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
 
 SIZE, TEXELS = 384, 384
@@ -26,6 +28,7 @@ VIEWS = (1, 2, 4, 8)
 YAW, PITCH = 60.0, 15.0
 NOISE = 1.0  # pixels
 RESULTS = Path(__file__).resolve().parent / "results"
+Table = dict[str, dict[str, list[float]]]  # kind of fit and number of photos -> error -> value of each photo
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,11 @@ def make_subject(head: HeadModel, seed: int, pictures: bool, detector: bool) -> 
     marks = marks + NOISE * torch.randn(marks.shape, generator=generator)
     images = render_photos(head, vertices, cameras, seed) if pictures or detector else None
     if detector and images is not None:
-        marks = detect(images, marks)
+        found = detect(images)
+        seen = torch.tensor([n for n, mesh in enumerate(found) if mesh is not None])
+        marks = torch.stack([mesh for mesh in found if mesh is not None])
+        cameras = Camera(cameras.viewmat[seen], cameras.K[seen], SIZE, SIZE)
+        return Subject(truth[seen], vertices[seen], cameras, marks, [images[n] for n in seen.tolist()])
     return Subject(truth, vertices, cameras, marks, images)
 
 
@@ -74,14 +81,12 @@ def render_photos(head: HeadModel, vertices: Tensor, cameras: Camera, seed: int)
     return [torch.from_numpy(shot).permute(2, 0, 1).contiguous() for shot in shots]
 
 
-def detect(images: list[Tensor], fallback: Tensor) -> Tensor:
-    from uika.photo.nets import face_meshes
+def detect(images: list[Tensor]) -> list[Tensor | None]:
+    """Landmarks [478,2] of each picture, found as `uika.photo` finds them; None where there are none."""
+    from uika.photo.detect import find_face
 
     bytes_ = [(image.permute(1, 2, 0) * 255).round().byte().numpy().copy() for image in images]
-    found = face_meshes(bytes_)
-    return torch.stack(
-        [torch.from_numpy(mesh).float() if mesh is not None else fallback[n] for n, mesh in enumerate(found)]
-    )
+    return [None if (mesh := find_face(image)) is None else torch.from_numpy(mesh).float() for image in bytes_]
 
 
 def errors(head: HeadModel, subject: Subject, found: LandmarkFit) -> dict[str, list[float]]:
@@ -110,7 +115,7 @@ def errors(head: HeadModel, subject: Subject, found: LandmarkFit) -> dict[str, l
     for n in range(N):
         both = valid[n] & true_valid[n]
         result["uv"].append(float((uv[n] - true_uv[n])[both].norm(dim=-1).median()) * TEXELS)
-    return result
+    return dict(result)
 
 
 def aligned_distance(points: Tensor, truth: Tensor) -> float:
@@ -120,6 +125,22 @@ def aligned_distance(points: Tensor, truth: Tensor) -> float:
     return float((a @ (u @ vt) * (s.sum() / a.square().sum()) - b).norm(dim=-1).mean()) * 1e3
 
 
+def measure(head: HeadModel, seed: int, refine: bool, detector: bool) -> Table:
+    """Errors of one person, by kind of fit and number of photos."""
+    table: Table = {}
+    subject = make_subject(head, seed, pictures=refine, detector=detector)
+    for N in VIEWS:
+        if len(subject.landmarks) < N:
+            break
+        found = fit_landmarks(subject.landmarks[:N], head, SIZE)
+        table[f"landmarks {N}"] = errors(head, subject, found)
+        if refine and N > 1 and subject.images is not None:
+            refined, _ = refine_landmark_fit(found, subject.images[:N], subject.landmarks[:N], head)
+            table[f"landmarks of the same people {N}"] = table[f"landmarks {N}"]
+            table[f"refined {N}"] = errors(head, subject, refined)
+    return table
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=int, default=50, help="for the landmark fit")
@@ -127,37 +148,45 @@ def main() -> None:
     parser.add_argument(
         "--detector", action="store_true", help="landmarks of the face mesh detector, not the true ones"
     )
+    parser.add_argument("--resume", type=Path, help="folder that keeps each person's figures for a later run")
     arguments = parser.parse_args()
     head = load_head()
-    table: dict[tuple[str, int], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    tables: list[Table] = []
     for seed in range(arguments.people):
         refine = seed < arguments.refined
-        subject = make_subject(head, seed, pictures=refine, detector=arguments.detector)
-        for N in VIEWS:
-            found = fit_landmarks(subject.landmarks[:N], head, SIZE)
-            for name, values in errors(head, subject, found).items():
-                table["landmarks", N][name] += values
-                if refine:
-                    table["landmarks (same people)", N][name] += values
-            if refine and N > 1 and subject.images is not None:
-                refined, _ = refine_landmark_fit(found, subject.images[:N], subject.landmarks[:N], head)
-                for name, values in errors(head, subject, refined).items():
-                    table["refined", N][name] += values
+        name = f"{'detected' if arguments.detector else 'true'}_{seed}{'_refined' if refine else ''}.json"
+        kept = arguments.resume / name if arguments.resume else None
+        if kept is None or not kept.exists():
+            tables.append(measure(head, seed, refine, arguments.detector))
+            if kept is not None:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                with replacing(kept) as temporary:
+                    temporary.write_text(json.dumps(tables[-1]))
+        else:
+            tables.append(json.loads(kept.read_text()))
         print(f"person {seed + 1} of {arguments.people}", flush=True)
-    write(table, arguments)
+    write(tables, arguments)
 
 
-def write(table: dict[tuple[str, int], dict[str, list[float]]], arguments: argparse.Namespace) -> None:
+def write(tables: list[Table], arguments: argparse.Namespace) -> None:
     rows = []
-    for (kind, N), values in sorted(table.items()):
-        row: dict[str, object] = {"fit": kind, "views": N, "photos": len(values["pose"])}
-        for name, unit in (("vertex", "mm"), ("pose", "deg"), ("uv", "texels")):
-            row[f"{name} median {unit}"] = round(float(np.median(values[name])), 2)
-            row[f"{name} p95 {unit}"] = round(float(np.percentile(values[name], 95)), 2)
-        rows.append(row)
-    source = "detected" if arguments.detector else f"true + {NOISE:g} px noise"
+    kinds = ["landmarks"] + ["landmarks of the same people"] * (arguments.refined < arguments.people) + ["refined"]
+    for kind in kinds:
+        for N in VIEWS:
+            people = [table[f"{kind} {N}"] for table in tables if f"{kind} {N}" in table]
+            if not people:
+                continue
+            row: dict[str, object] = {"fit": kind, "views": N, "people": len(people)}
+            for name, unit in (("vertex", "mm"), ("pose", "deg"), ("uv", "texels")):
+                values = np.concatenate([person[name] for person in people])
+                row[f"{name} median {unit}"] = round(float(np.median(values)), 2)
+                row[f"{name} p95 {unit}"] = round(float(np.percentile(values, 95)), 2)
+            rows.append(row)
+    source = "found by the detector" if arguments.detector else f"true + {NOISE:g} px noise"
     text = (
-        f"# Fit accuracy\n\nLandmarks: {source}. {arguments.people} people, yaw within {YAW:g} degrees, {SIZE} px.\n\n"
+        f"# Fit accuracy\n\nLandmarks: {source}. {arguments.people} people with another expression in each photo, "
+        f"yaw within {YAW:g} and pitch within {PITCH:g} degrees, {SIZE} px. "
+        f"Refined: {min(arguments.refined, arguments.people)} of them.\n\n"
     )
     text += "| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]) + "\n"
     text += "".join("| " + " | ".join(str(value) for value in row.values()) + " |\n" for row in rows)

@@ -143,7 +143,7 @@ def test_shared_colours_sharpen_the_identity(head: HeadModel) -> None:
     targets = {index: seen(true, pose) for index, pose in poses.items()}
     guess = torch.zeros_like(identity)
     blank, model = make_appearance(head, guess, FOCAL, unit), frame_model(head, guess, FOCAL, unit)
-    found = bundle(head, blank, model, poses, views, targets, 0.01)
+    found = bundle(head, blank, model, poses, views, targets, 1e-4)
     assert found.costs[1] < 0.7 * found.costs[0]
     sharper = guess.clone()
     sharper[: len(found.offset)] += torch.from_numpy(found.offset).float()

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uika.correspondence.anchor import identity_modes, landmark_anchor
 from uika.correspondence.appearance import (
     CORRELATED,
     EXPRESSION_PRIOR,
@@ -27,7 +28,7 @@ from uika.correspondence.appearance import (
     point_trust,
     sample,
 )
-from uika.correspondence.frames import FrameModel, Pose, landmark_pull, moved, shifted
+from uika.correspondence.frames import FrameModel, Pose, moved, shifted
 from uika.correspondence.turns import Array
 from uika.head import HeadModel
 
@@ -68,15 +69,15 @@ def bundle(
         poses: start of each frame.
         views: each frame's picture.
         targets: each frame's landmarks [478,2], pixels relative to the principal point.
-        pull: weight of the landmarks on each frame's pose.
+        pull: weight of the landmarks, on poses and identity.
         focal_spread: expected error of the logarithm of the focal length; tiny to keep it.
     """
     frames = sorted(poses)
     P = len(model.free) + 3 * len(model.joints) + 6
     state = Bundle(np.zeros(MODES), model.focal, dict(poses), (0.0, 0.0))
-    modes = _modes(head, person.model)
-    anchors = {k: tuple(pull * part for part in landmark_pull(model, poses[k], targets[k])) for k in frames}
-    travelled = {k: np.zeros(P) for k in frames}
+    modes, marks = identity_modes(head, person.model, MODES), identity_modes(head, model, MODES)
+    anchors = {k: tuple(pull * part for part in landmark_anchor(model, marks, poses[k], targets[k])) for k in frames}
+    travelled = {k: np.zeros(MODES + 1 + P) for k in frames}
     rows = _rows(person.model, modes, state, views, frames)
     cost = first = _cost(rows, state, travelled, anchors, model.focal, focal_spread)
     damping = _DAMPING
@@ -88,7 +89,7 @@ def bundle(
             {k: moved(model, state.poses[k], steps[k]) for k in frames},
             state.costs,
         )
-        far = {k: travelled[k] + steps[k] for k in frames}
+        far = {k: travelled[k] + np.concatenate((shared, steps[k])) for k in frames}
         trial_rows = _rows(person.model, modes, trial, views, frames)
         trial_cost = _cost(trial_rows, trial, far, anchors, model.focal, focal_spread)
         if trial_cost < cost:
@@ -96,14 +97,6 @@ def bundle(
         else:
             damping *= 10
     return replace(state, costs=(first, cost))
-
-
-def _modes(head: HeadModel, model: FrameModel) -> NDArray[np.float32]:
-    """Identity modes [3,M,MODES] at the model's points."""
-    corners = head.faces[model.triangle]
-    mix = model.barycentric
-    basis = head.identity_basis[:MODES]
-    return (basis[:, corners] * mix[None, :, :, None]).sum(2).permute(2, 1, 0).contiguous().numpy()
 
 
 @dataclass(frozen=True)
@@ -215,8 +208,9 @@ def _step(
         diagonal = np.arange(at.start, at.start + E)
         matrix[diagonal, diagonal] += EXPRESSION_PRIOR
         gradient[diagonal] += EXPRESSION_PRIOR * state.poses[k].expression
-        matrix[at, at] += anchors[k][0]
-        gradient[at] += anchors[k][1] + anchors[k][0] @ travelled[k]
+        every = np.r_[:K, at.start : at.stop]
+        matrix[np.ix_(every, every)] += anchors[k][0]
+        gradient[every] += anchors[k][1] + anchors[k][0] @ travelled[k]
     coupling /= np.sqrt(np.maximum(weight.sum(0), 1e-9))[:, None]
     matrix -= coupling.T @ coupling
     identity = np.arange(K - 1)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.correspondence.anchor import landmark_trust
 from uika.correspondence.appearance import View, face_view, follow, learn, make_appearance
 from uika.correspondence.bundle import bundle
 from uika.correspondence.frames import Pose, frame_model, landmark_pull
@@ -17,7 +18,6 @@ from uika.correspondence.turns import Array
 from uika.head import HeadModel
 
 BLUR = 0.8  # pixels of the face crop
-LANDMARK_PULL = 0.03
 FOLLOW_STEPS = 6
 _LUMA = (0.299, 0.587, 0.114)
 
@@ -73,14 +73,15 @@ def refine_landmark_fit(
             fit.rotation[n].numpy(),
             fit.translation[n].numpy(),
         )
+    trust = landmark_trust(model, poses, targets)
     first = min(poses, key=lambda n: float(np.abs(poses[n].rotation[2, :2]).sum()))
     person = learn(person, poses[first], views[first])
     for n in sorted(poses, key=lambda n: float(np.linalg.norm(poses[n].rotation - poses[first].rotation))):
         matrix, gradient = landmark_pull(model, poses[n], targets[n])
-        pull = (LANDMARK_PULL * matrix, LANDMARK_PULL * gradient)
+        pull = (trust * matrix, trust * gradient)
         poses[n], _ = follow(person, [(views[n], FOLLOW_STEPS)], poses[n], poses[n], pull)
         person = learn(person, poses[n], views[n])
-    found = bundle(head, person, model, poses, views, targets, LANDMARK_PULL, focal_spread=1e-3)
+    found = bundle(head, person, model, poses, views, targets, trust, focal_spread=1e-3)
     identity = fit.identity.clone()
     identity[: len(found.offset)] += torch.from_numpy(found.offset)
     order = sorted(found.poses)

@@ -1,0 +1,108 @@
+"""Refinement by colours trusts landmarks as far as their errors allow."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from uika.convert.embed import paint, shade
+from uika.correspondence import fit_landmarks
+from uika.correspondence.anchor import identity_modes, landmark_anchor, landmark_trust
+from uika.correspondence.frames import FrameModel, Pose, frame_model, head_landmarks, moved, shifted
+from uika.correspondence.landmarks import eye_distance
+from uika.correspondence.refine import refine_landmark_fit
+from uika.correspondence.turns import Array, rotation
+from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
+
+FOCAL = 1200.0
+SIZE = 256
+YAWS = (-35.0, 0.0, 35.0)
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+def turned(model: FrameModel) -> Pose:
+    turn = np.diag([1.0, -1.0, -1.0]) @ rotation(np.array([0.05, 0.3, 0.0]))
+    return Pose(np.full(len(model.free), 0.1), np.zeros((0, 3, 3)), turn, np.array([0.0, 0.0, 1.1]))
+
+
+def seen(model: FrameModel, pose: Pose) -> Array:
+    camera = head_landmarks(model, pose) @ pose.rotation.T + pose.translation
+    marks = np.zeros((478, 2))
+    marks[model.ids] = model.focal * camera[:, :2] / camera[:, 2:]
+    return marks
+
+
+def test_smooth_errors_earn_less_trust_than_noise(head: HeadModel) -> None:
+    model = frame_model(head, torch.zeros(len(head.identity_basis)), FOCAL, eye_distance(head))
+    pose, random = turned(model), np.random.default_rng(0)
+    marks = seen(model, pose)
+    noise = random.normal(size=marks.shape)
+    place = marks / np.ptp(marks[model.ids], axis=0)
+    smooth = np.stack((np.sin(9 * place[:, 1]), np.cos(8 * place[:, 0])), -1)
+    trust = {
+        name: landmark_trust(model, {0: pose}, {0: marks + error}) for name, error in (("n", noise), ("s", smooth))
+    }
+    assert trust["noise"] > 1
+    assert trust["smooth"] < 0.1 * trust["noise"]
+    half = landmark_trust(model, {0: pose}, {0: marks + noise / 2})
+    assert half > 3 * trust["noise"]
+
+
+def test_the_anchor_is_the_slope_of_the_landmark_error(head: HeadModel) -> None:
+    model = frame_model(head, torch.zeros(len(head.identity_basis)), FOCAL, eye_distance(head))
+    pose, count = turned(model), 12
+    modes = identity_modes(head, model, count)
+    target = seen(model, pose) + 1e-4 * np.random.default_rng(1).normal(size=(478, 2))
+    matrix, _ = landmark_anchor(model, modes, pose, target)
+    for index in (2, count + 1 + 5, len(matrix) - 5, len(matrix) - 1):
+        step = np.zeros(len(matrix))
+        step[index] = 1e-3
+        other = shifted(model, np.asarray(modes @ step[:count], dtype=np.float64).T)
+        # At a perfect fit the change of the gradient over a step is the matrix's column.
+        met = landmark_anchor(model, modes, pose, seen(model, pose))[1]
+        change = landmark_anchor(other, modes, moved(model, pose, step[count + 1 :]), seen(model, pose))[1] - met
+        expected = matrix[:, index] * 1e-3
+        assert np.abs(change - expected).max() < 0.03 * np.abs(expected).max()
+
+
+def face_error(head: HeadModel, found: Tensor, truth: Tensor) -> float:
+    """Mean distance of the neutral faces in mm, after the best similarity."""
+    face = head.masks["face"] > 0.5
+    a, b = ((head.template + torch.einsum("k,kvc->vc", i.float(), head.identity_basis))[face] for i in (found, truth))
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, s, vt = torch.linalg.svd(a.T @ b)
+    return float((a @ (u @ vt) * (s.sum() / a.square().sum()) - b).norm(dim=-1).mean()) * 1e3
+
+
+@pytest.fixture(scope="module")
+def photos(head: HeadModel) -> tuple[Tensor, list[Tensor], Tensor]:
+    """A painted head from three sides: its identity, pictures and exact landmarks."""
+    generator = torch.Generator().manual_seed(4)
+    identity = 0.8 * torch.randn(len(head.identity_basis), generator=generator)
+    vertices = pose_vertices(head, HeadParameters.zeros(head).replace(identity=identity))
+    views = [look_at(yaw, 0.0, 1.0, (0.0, -0.01, 0.0), fov_y=20.0, size=SIZE) for yaw in YAWS]
+    colours = paint(head)
+    pictures = [torch.from_numpy(shade(vertices, head.faces, colours, view)[0]).float() / 255 for view in views]
+    marks = torch.full((len(YAWS), 478, 2), SIZE / 2)
+    marks[:, head.landmark_ids] = project(head.landmarks(vertices).expand(len(YAWS), -1, -1), Camera.stack(views))[0]
+    return identity, [picture.permute(2, 0, 1) for picture in pictures], marks
+
+
+def test_good_landmarks_are_not_spoiled(head: HeadModel, photos: tuple[Tensor, list[Tensor], Tensor]) -> None:
+    identity, pictures, marks = photos
+    noisy = marks + 0.7 * torch.randn(marks.shape, generator=torch.Generator().manual_seed(0))
+    found = fit_landmarks(noisy, head, SIZE)
+    refined, gain = refine_landmark_fit(found, pictures, noisy, head)
+    assert gain is not None
+    assert gain.after < gain.before
+    assert face_error(head, refined.identity, identity) < 1.05 * face_error(head, found.identity, identity)
+
+
+def test_one_photo_stays_as_it_is(head: HeadModel, photos: tuple[Tensor, list[Tensor], Tensor]) -> None:
+    _, pictures, marks = photos
+    found = fit_landmarks(marks[:1], head, SIZE)
+    assert refine_landmark_fit(found, pictures[:1], marks[:1], head) == (found, None)
