@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from uika.errors import UikaError
+from uika.evaluate_command import Evaluate
 from uika.export_command import Export
 from uika.files import check_folder, check_output
 from uika.motion_commands import Head, Track
@@ -253,7 +254,21 @@ class Bench:
         return main(["--preset", self.preset, "--views", *counts, "-o", str(check_folder(self.output))])
 
 
-Command = Reconstruct | Animate | Track | Render | Export | Demo | Head | Train | Synthesize | Weights | Bench | Doctor
+Command = (
+    Reconstruct
+    | Animate
+    | Track
+    | Render
+    | Export
+    | Demo
+    | Head
+    | Train
+    | Synthesize
+    | Evaluate
+    | Weights
+    | Bench
+    | Doctor
+)
 
 
 def _check_photos(photos: tuple[Path, ...]) -> None:

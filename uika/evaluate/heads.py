@@ -1,0 +1,103 @@
+"""Avatars from source frames, and pictures of them in the place of target frames."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from uika.avatar import Avatar
+from uika.correspondence import Fit
+from uika.data import Sample
+from uika.evaluate.protocol import Protocol
+from uika.evaluate.sequences import check_sample
+from uika.files import replacing
+from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
+from uika.reconstruction import LoadedModel, Report, avatar_from_fit, reconstruct
+from uika.rendering import render
+from uika.train.crops import View
+from uika.train.items import aligned_camera
+from uika.video import to_bytes
+
+_PHOTO_SIDE = 512  # pixels of photos for networks that take any
+
+
+def make_avatar(
+    sources: Sequence[Sample], loaded: LoadedModel, model: str, correspondence: str, head: HeadModel
+) -> Avatar:
+    """Reconstruct from source frames, by landmark fits of the pictures ("fit") or their true heads ("exact").
+
+    Raises:
+        PhotoError: a source shows no face that can be found.
+        DataError: a source lacks the head parameters that "exact" needs.
+    """
+    if correspondence == "fit":
+        with tempfile.TemporaryDirectory() as folder:
+            paths = [Path(folder) / f"{sample.key}.png" for sample in sources]
+            for path, sample in zip(paths, sources, strict=True):
+                _write_cutout(path, sample)
+            return reconstruct(paths, head, model).avatar
+    for sample in sources:
+        check_sample(sample, head)
+    views = [View(sample, loaded.network.config.image_size or _PHOTO_SIDE) for sample in sources]
+    parameters = HeadParameters.stack([_parameters(view) for view in views])
+    fit = Fit(parameters, Camera.stack([v.camera for v in views]), _offset(views[0], head), torch.zeros(len(views)))
+    images = torch.stack([view.over(torch.ones(3)) for view in views])
+    mattes = torch.stack([view.mask for view in views])
+    return avatar_from_fit(loaded, head, fit, images, mattes, [view.key for view in views], Report())
+
+
+def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: float) -> list[Tensor]:
+    """Pictures [S,S,3] of the avatar with the pose, expression and camera of each target, rounded to 8 bits."""
+    canonical = avatar.canonical_vertices(head)
+    pictures = []
+    for view in targets:
+        params = _parameters(view).replace(identity=avatar.identity)
+        truth = pose_vertices(head, _parameters(view), _offset(view, head))
+        own = pose_vertices(head, params, avatar.static_offset)
+        camera = aligned_camera(own, truth, head.masks["face"], view.camera)
+        pictures.append(rounded(render(avatar, params, camera, head, [background] * 3, canonical=canonical).rgb))
+    return pictures
+
+
+def target_views(samples: Sequence[Sample], protocol: Protocol, head: HeadModel) -> list[View]:
+    """Targets, squared and resized as the protocol says.
+
+    Raises:
+        DataError: one has no parameters of this head model.
+    """
+    for sample in samples:
+        check_sample(sample, head)
+    return [View(sample, protocol.size) for sample in samples]
+
+
+def truth_picture(view: View, background: float) -> Tensor:
+    """A target [S,S,3] on the protocol's background, rounded to 8 bits."""
+    return rounded(view.over(torch.full((3,), background)).permute(1, 2, 0))
+
+
+def rounded(picture: Tensor) -> Tensor:
+    """The picture as an 8-bit file would keep it."""
+    return torch.from_numpy(to_bytes(picture).astype(np.float32) / 255)
+
+
+def _write_cutout(path: Path, sample: Sample) -> None:
+    from PIL import Image
+
+    view = View(sample, max(sample.mask.shape))
+    planes = torch.cat((view.image, view.mask[None])).permute(1, 2, 0)
+    with replacing(path) as temporary:
+        Image.fromarray(to_bytes(planes)).save(temporary)
+
+
+def _parameters(view: View) -> HeadParameters:
+    assert view.parameters is not None  # check_sample
+    return view.parameters
+
+
+def _offset(view: View, head: HeadModel) -> Tensor:
+    return torch.zeros_like(head.template) if view.static_offset is None else view.static_offset

@@ -1,0 +1,244 @@
+"""From data and a model to the results of every sequence."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from uika.data import DataError
+from uika.errors import UikaError
+from uika.evaluate.external import check_external, external_picture
+from uika.evaluate.heads import drive, make_avatar, target_views, truth_picture
+from uika.evaluate.protocol import Protocol
+from uika.evaluate.score import Judges, Pictures, faces_found, score
+from uika.evaluate.sequences import Sequence, choose_frames
+from uika.evaluate.store import (
+    PICTURES,
+    Result,
+    agree,
+    plain_name,
+    read_result,
+    result_file,
+    write_frames,
+    write_result,
+)
+from uika.evaluate.strips import write_strip
+from uika.files import check_folder
+from uika.head import HeadModel, load_head
+from uika.lpips import Lpips
+from uika.metrics.arcface import ArcFace
+from uika.photo import PhotoError
+from uika.progress import counted
+from uika.reconstruction import MAX_PHOTOS, LoadedModel, load_model
+from uika.train.crops import View
+from uika.train.people import find_people
+from uika.weights import sha256
+
+SHOWN = 2  # targets of each result that pictures are kept of
+_SIZES = (32, 2048)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What to evaluate; meanings as in `uika evaluate`."""
+
+    data: Path
+    output: Path
+    setting: str = "mono"
+    task: str = "self"
+    views: tuple[int, ...] = (1, 2, 4, 8, 16)
+    model: str = "tiny"
+    name: str = ""
+    correspondence: str = "fit"
+    size: int = 512
+    background: float = 1.0
+    targets: int = 8
+    lpips: Path | None = None
+    arcface: Path | None = None
+    external: Path | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run did: results made and kept, and one sentence for each that could not be made."""
+
+    protocol: Protocol
+    made: int
+    kept: int
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """The targets of a sequence."""
+
+    views: list[View]
+    pictures: Pictures
+    masks: list[Tensor]
+
+
+@torch.no_grad()
+def evaluate(settings: Evaluation, head: HeadModel | None = None, progress: bool = False) -> Outcome:
+    """Score all sequences that have no result yet; `uika.evaluate.write_report` makes the tables.
+
+    Raises:
+        UikaError: the settings, the data or a weights file cannot be used, the report's folder holds results of other
+            choices, or frames of the other system are missing.
+    """
+    _check(settings)
+    head = load_head() if head is None else head
+    loaded = None if settings.external else load_model(settings.model)
+    judges = Judges(
+        head,
+        None if settings.lpips is None else Lpips(settings.lpips),
+        None if settings.arcface is None else ArcFace(settings.arcface),
+    )
+    protocol = _protocol(settings, loaded, head)
+    paths = find_people(settings.data)
+    missing: list[str] = []
+    sequences = []
+    for path in paths:
+        try:
+            sequences.append(choose_frames(path, settings.setting, settings.targets, head))
+        except DataError as error:
+            missing.append(str(error))
+    if not sequences:
+        raise UikaError(f"{settings.data}: no sequence can be used; the first reason: {missing[0]}")
+    drivers = {each.name: _driver(sequences, index, settings) for index, each in enumerate(sequences)}
+    jobs = []
+    for sequence in sequences:
+        for views in sorted(set(settings.views)):
+            if views <= len(sequence.sources):
+                jobs.append((sequence, views))
+            else:
+                missing.append(f"{sequence.name}: has {len(sequence.sources)} source frames, too few for {views} views")
+    if not jobs:
+        raise UikaError(f"{settings.data}: no sequence has enough source frames; the first reason: {missing[0]}")
+    if settings.external is not None:
+        check_external(settings.external, [(s.name, v, drivers[s.name].target_names) for s, v in jobs])
+    folder = agree(check_folder(settings.output), protocol)
+    write_frames(folder, {s.name: _frames(s, drivers[s.name]) for s in sequences})
+    made = kept = 0
+    run = _Run(settings, protocol, loaded, judges)
+    for sequence, views in counted(jobs, progress, len(jobs), "evaluate"):
+        if read_result(result_file(folder, sequence.name, views), protocol) is not None:
+            kept += 1
+            continue
+        try:
+            write_result(folder, run.result(sequence, drivers[sequence.name], views))
+            made += 1
+        except (DataError, PhotoError) as error:
+            missing.append(f"{sequence.name} with {views} views: {error}")
+    return Outcome(protocol, made, kept, tuple(missing))
+
+
+class _Run:
+    """One evaluation; the driver's faces are looked for once for all numbers of views."""
+
+    def __init__(self, settings: Evaluation, protocol: Protocol, loaded: LoadedModel | None, judges: Judges) -> None:
+        self._settings, self._protocol, self._loaded, self._judges = settings, protocol, loaded, judges
+        self._truths: dict[str, _Truth] = {}
+
+    def result(self, sequence: Sequence, driver: Sequence, views: int) -> Result:
+        """Make an avatar of a sequence and score it."""
+        protocol, judges = self._protocol, self._judges
+        sources = [sequence.person.sample(index) for index in sequence.sources[:views]]
+        truth, seconds = self._truth(driver), 0.0
+        if self._loaded is None:
+            assert self._settings.external is not None
+            place = self._settings.external, sequence.name, views
+            images = [external_picture(*place, name, protocol.size) for name in driver.target_names]
+        else:
+            start = time.perf_counter()
+            how = self._settings.model, self._settings.correspondence
+            avatar = make_avatar(sources, self._loaded, *how, judges.head)
+            seconds = time.perf_counter() - start
+            images = drive(avatar, truth.views, judges.head, protocol.background)
+        results = Pictures.of(images)
+        shown = truth_picture(View(sources[0], protocol.size), protocol.background)
+        person = Pictures.of([shown] if judges.arcface is not None and protocol.task == "cross" else [])
+        return Result(
+            protocol=protocol.digest(),
+            sequence=sequence.name,
+            views=views,
+            driver=driver.name,
+            sources=sequence.source_names[:views],
+            targets=driver.target_names,
+            scores=score(results, truth.pictures, truth.masks, person, protocol, judges),
+            faces=len(faces_found(results, truth.pictures)),
+            seconds=round(seconds, 2),
+            pictures=tuple(self._strips(sequence, views, shown, results, truth)),
+        )
+
+    def _truth(self, driver: Sequence) -> _Truth:
+        if driver.name not in self._truths:
+            samples = [driver.person.sample(index) for index in driver.targets]
+            views = target_views(samples, self._protocol, self._judges.head)
+            pictures = Pictures.of([truth_picture(view, self._protocol.background) for view in views])
+            self._truths = {driver.name: _Truth(views, pictures, [view.mask >= 0.5 for view in views])}
+        return self._truths[driver.name]
+
+    def _strips(
+        self, sequence: Sequence, views: int, source: Tensor, results: Pictures, truth: _Truth
+    ) -> Iterator[str]:
+        """Write pictures of the first targets; paths inside the report's folder."""
+        protocol, report = self._protocol, self._settings.output
+        place = Path(PICTURES) / f"{protocol.setting}-{protocol.task}" / plain_name(protocol.method)
+        for index in range(min(SHOWN, len(results.images))):
+            name = place / f"{plain_name(sequence.name)}_{views:02d}_{index}.png"
+            write_strip(report / name, source, results.images[index], truth.pictures.images[index], protocol.task)
+            yield name.as_posix()
+
+
+def _driver(sequences: list[Sequence], index: int, settings: Evaluation) -> Sequence:
+    """Whose frames drive a sequence: its own, or for cross reenactment those of the next other person."""
+    own = sequences[index]
+    if settings.task == "self":
+        return own
+    for step in range(1, len(sequences)):
+        other = sequences[(index + step) % len(sequences)]
+        if other.identity != own.identity:
+            return other
+    raise UikaError(f"{settings.data}: cross reenactment needs two people, and only '{own.identity}' can be used")
+
+
+def _frames(sequence: Sequence, driver: Sequence) -> dict[str, object]:
+    return {"sources": sequence.source_names, "driver": driver.name, "targets": driver.target_names}
+
+
+def _protocol(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> Protocol:
+    external = settings.external is not None
+    name = settings.name or (settings.external.name if settings.external else Path(settings.model).stem)
+    model = f"pictures in {name}" if loaded is None else loaded.name
+    if loaded is not None and Path(settings.model).is_file():
+        model = f"{model}, sha256 {sha256(Path(settings.model))[:12]}"
+    return Protocol(
+        data=settings.data.resolve().name,
+        setting=settings.setting,
+        task=settings.task,
+        method=name,
+        model=model,
+        correspondence="" if external else settings.correspondence,
+        head=head.id,
+        size=settings.size,
+        background=settings.background,
+        targets=settings.targets,
+        lpips="" if settings.lpips is None else sha256(settings.lpips)[:12],
+        arcface="" if settings.arcface is None else sha256(settings.arcface)[:12],
+    )
+
+
+def _check(settings: Evaluation) -> None:
+    if not settings.views or not all(1 <= count <= MAX_PHOTOS for count in settings.views):
+        raise UikaError(f"views must be numbers from 1 to {MAX_PHOTOS}, such as 1,2,4, not {list(settings.views)}")
+    if not _SIZES[0] <= settings.size <= _SIZES[1]:
+        raise UikaError(f"size must lie between {_SIZES[0]} and {_SIZES[1]} pixels, not {settings.size}")
+    if not 0 <= settings.background <= 1:
+        raise UikaError(f"background must be a grey level in [0,1], not {settings.background:g}")
+    if settings.targets < 1:
+        raise UikaError(f"targets must be at least 1, not {settings.targets}")

@@ -1,0 +1,81 @@
+"""The command `uika evaluate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from uika.errors import UikaError
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score avatars against held-out frames, in the paper's settings; the report gathers all runs in its folder.
+
+    Run the same command again to go on after an interruption. Example: uika evaluate --data people -o report
+    """
+
+    data: Path
+    """A folder with captures or shards, such as `uika synthesize` makes."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("report")
+    """The report's folder."""
+    setting: Literal["mono", "multi"] = "mono"
+    """Frames of one camera, or of several."""
+    task: Literal["self", "cross"] = "self"
+    """Whether the person's own held-out frames drive the head, or those of another person."""
+    views: str = "1,2,4,8,16"
+    """Numbers of source frames, with commas."""
+    model: str = "tiny"
+    """tiny, none, or a trained model file."""
+    name: str = ""
+    """The method's name in the tables; the model's or folder's name if left out."""
+    correspondence: Literal["fit", "exact"] = "fit"
+    """Sources as pictures alone, or with their true heads and cameras."""
+    size: int = 512
+    """Side of the compared pictures in pixels."""
+    background: float = 1.0
+    """Grey level behind the person, 0 to 1."""
+    targets: int = 8
+    """Target frames of each sequence, at most."""
+    lpips: Path | None = None
+    """LPIPS weights (.safetensors)."""
+    arcface: Path | None = None
+    """An ArcFace network (.onnx) for CSIM."""
+    external: Path | None = None
+    """Score another system's pictures in this folder, SEQUENCE/VIEWS/TARGET.png, instead of a model's."""
+
+    def run(self) -> int:
+        """Evaluate, write the report and print the table."""
+        counts = _counts(self.views)
+        from uika.evaluate import Evaluation, evaluate, gather, write_report
+        from uika.evaluate.report import markdown_table
+
+        if self.external is None:
+            from uika.reconstruction import check_model
+            from uika.rendering import check_renderer
+
+            check_model(self.model)
+            check_renderer()
+        given = {field.name: getattr(self, field.name) for field in fields(Evaluation)} | {"views": counts}
+        outcome = evaluate(Evaluation(**given), progress=True)
+        written = write_report(self.output)
+        for section in gather(self.output):
+            if (section.setting, section.task) == (self.setting, self.task):
+                print("\n".join([section.title, *markdown_table(section)]))
+        print("\n".join(f"- {line}" for line in outcome.protocol.sentences()))
+        for sentence in outcome.missing:
+            print(f"left out: {sentence}")
+        print(f"{outcome.made} results made, {outcome.kept} were complete")
+        for path in written:
+            print(f"wrote {path}")
+        return 0
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() for part in parts):
+        raise UikaError(f"--views must be whole numbers with commas, such as 1,2,4, not '{text}'")
+    return tuple(int(part) for part in parts)
