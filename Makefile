@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 # Idle OpenMP threads would spin on the cores Dr.Jit needs.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup demo test test-all lint format bench bake clean
+.PHONY: setup demo test test-all lint format bench docs bake clean
 
 setup: $(READY) llvm
 
@@ -39,9 +39,15 @@ format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# One after the other and nothing beside them: they measure time.
+BENCHMARKS := head_quality rasterizer_table rasterizer_accuracy rasterizer_pareto rasterizer_skips rasterizer_determinism \
+	rasterizer_scaling rasterizer_peers
 bench: setup
-	$(BIN)/python -m benchmarks.head_quality
-	$(BIN)/python -m benchmarks.rasterizer_table
+	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name || exit 1; done
+	$(BIN)/python tools/readme_figures.py
+
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 bake: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,bake]'

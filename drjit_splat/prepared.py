@@ -85,9 +85,9 @@ def prepare(
 ) -> Prepared:
     """Do everything that colours cannot change, for `Prepared.shade` to reuse.
 
+    The arguments that are not listed are those of `rasterization`; they get no gradients.
+
     Args:
-        means, quats, scales, opacities, viewmats, Ks, width, height, covars, options: as in `rasterization`; they get
-            no gradients.
         opacities_change: make lists that hold for any opacities, at the price of longer ones.
         arguments: `near_plane`, `far_plane`, `radius_clip`, `eps2d`, `sh_degree`, `render_mode` (with colours),
             `rasterize_mode` and `semantics` of `rasterization`.

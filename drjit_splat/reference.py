@@ -211,10 +211,9 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render as `drjit_splat.rasterization` does, in float64.
 
+    The arguments that are not listed are those of `drjit_splat.rasterization`.
+
     Args:
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d,
-            sh_degree, backgrounds, render_mode, rasterize_mode, covars, semantics, options: as in
-            `drjit_splat.rasterization`.
         order: [C, N] splat ids near to far; by default the float64 depths decide.
         decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
 

@@ -1,6 +1,10 @@
-"""Put the tables of `benchmarks/results/NAME.md` between the markers `<!-- figures: NAME -->` of README and docs."""
+"""Put the tables of `benchmarks/results/NAME.md` between the markers `<!-- figures: NAME -->` of README and docs.
+
+The benchmarks' pictures are copied to `docs/pictures`.
+"""
 
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -19,6 +23,8 @@ def main() -> int:
         lines = [line for line in path.read_text().strip().splitlines() if not line.startswith(("# ", "![]("))]
         return f"{match[1]}{chr(10).join(lines).strip()}\n{match[3]}"
 
+    for picture in sorted((ROOT / "benchmarks" / "results").glob("*.png")):
+        shutil.copy(picture, ROOT / "docs" / "pictures" / picture.name)
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         page.write_text(MARKED.sub(table, page.read_text()))
     for path in missing:
