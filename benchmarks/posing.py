@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import torch
 from PIL import Image
@@ -19,6 +20,8 @@ from torch import Tensor
 from uika.acting import expression_vector
 from uika.avatar import Avatar
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
+from uika.head.binding import rigid_turn
+from uika.head.rig import Rig
 from uika.surface import surface_texels
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -80,20 +83,29 @@ def timing(head: HeadModel) -> dict[str, object]:
     canonical, posed = head.template, pose_vertices(head, moving)
     means = (canonical[head.faces[triangle]] * mix[..., None]).sum(1)
     quats, scales = torch.nn.functional.normalize(torch.randn(COUNT, 4), dim=-1), torch.full((COUNT, 3), 1e-3)
-    arguments = (means, quats, scales, canonical, posed, head.faces, triangle, mix)
+    rig = Rig.of(means, quats, scales, canonical, head.faces, triangle, mix)
+    turn = rigid_turn(canonical, posed)
+
+    def kernels() -> None:
+        rig.pose(posed, turn)
+        dr.sync_thread()
+
     with torch.no_grad():
-        gaussians = fastest(lambda: pose_gaussians(*arguments))
+        fused = fastest(kernels)
+        gaussians = fastest(lambda: pose_gaussians(means, quats, scales, canonical, posed, head.faces, triangle, mix))
         vertices = fastest(lambda: pose_vertices(head, moving))
-    inputs = sum(t.numel() * t.element_size() for t in (means, quats, scales, triangle, mix))
+    inputs = 4 * (dr.width(rig.records) + dr.width(rig.rest) + dr.width(rig.corners) + 8 * len(canonical))
     outputs = sum(t.numel() * t.element_size() for t in (means, quats, scales))
     speed = bandwidth()
     return {
         "gaussians": COUNT,
         "threads": torch.get_num_threads(),
-        "pose_gaussians ms least": round(gaussians[0] * 1e3, 2),
-        "pose_gaussians ms median": round(gaussians[1] * 1e3, 2),
+        "kernels (`Rig.pose`) ms least": round(fused[0] * 1e3, 2),
+        "kernels (`Rig.pose`) ms median": round(fused[1] * 1e3, 2),
+        "torch (`pose_gaussians`) ms least": round(gaussians[0] * 1e3, 2),
+        "torch (`pose_gaussians`) ms median": round(gaussians[1] * 1e3, 2),
         "pose_vertices ms least": round(vertices[0] * 1e3, 2),
-        "megabytes in and out": round((inputs + outputs) / 1e6, 1),
+        "megabytes in and out of the kernels": round((inputs + outputs) / 1e6, 1),
         "memory gigabytes per second": round(speed / 1e9, 1),
         "ms at memory speed": round((inputs + outputs) / speed * 1e3, 2),
         "load": round(os.getloadavg()[0], 2),
