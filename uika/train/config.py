@@ -37,6 +37,7 @@ class TrainConfig:
     preset: str = "tiny"
     architecture: ModelConfig | None = None  # of the reconstructor in the place of the preset's, for ablations
     part: Part = "reconstructor"
+    fusion_bias: float = -3.0  # first logit of the fusion weight; untrained presets keep it so low that nothing learns
     steps: int = 20000
     seed: int = 0
     # Data
@@ -81,8 +82,12 @@ class TrainConfig:
 
     @property
     def model(self) -> ModelConfig:
-        """Architecture of the reconstructor."""
-        return PRESETS[self.preset] if self.architecture is None else self.architecture
+        """Architecture of the reconstructor, with the fusion weight's start for training."""
+        config = PRESETS[self.preset] if self.architecture is None else self.architecture
+        start = config.gaussians
+        if start.fusion_bias is None or start.fusion_bias >= self.fusion_bias:
+            return config
+        return dataclasses.replace(config, gaussians=dataclasses.replace(start, fusion_bias=self.fusion_bias))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary for JSON."""
