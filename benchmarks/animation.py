@@ -156,9 +156,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     RESULTS.mkdir(exist_ok=True)
     draw(rows, stages)
     text = (
-        f"{facts['processor']}, {facts['cores']} cores, load {facts['load'][0]} at the end: what exceeds the number of\n"
-        "cores is other work that took processor time and memory bandwidth meanwhile. Pictures of the talking default\n"
-        "avatar as bytes, without the video encoder; frames/s are those of the median frame.\n\n"
+        f"{facts['processor']}, {facts['cores']} cores, load {facts['load'][0]} at the end: what exceeds the number\n"
+        "of cores is other work that took processor time and memory bandwidth meanwhile. Pictures of the talking\n"
+        "default avatar as bytes, without the video encoder; frames/s are those of the median frame.\n\n"
         f"{markdown(rows)}\n\nStages of the whole avatar, least milliseconds, each waited for alone (in a film they\n"
         f"overlap with Python's part of the next frame):\n\n{markdown(stages)}\n\n"
         f"At 512 x 512, beside the differentiable way:\n\n{markdown(ways)}\n\n![](animation.png)"

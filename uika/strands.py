@@ -40,6 +40,6 @@ def strands(points: Tensor, color: Tensor, smooth: Tensor, seen: Tensor, hair: T
     crown = points[source, 1].max()
     wanted[:, 1] = crown - _RISE * (crown - wanted[:, 1]).clamp_min(0)
     place = torch.nonzero(source).flatten()
-    nearest = place[torch.from_numpy(cKDTree(points[source].numpy()).query(wanted.numpy())[1])]
+    nearest = place[torch.from_numpy(cKDTree(points[source].numpy()).query(wanted.numpy(), workers=-1)[1])]
     detail[target] = hair[target, None] * (color[nearest] - smooth[nearest])
     return detail

@@ -97,9 +97,33 @@ def test_code_in_a_pickle_is_refused_and_not_run(tmp_path: Path, protocol: int, 
     assert not mark.exists()
 
 
+@pytest.mark.parametrize("protocol", [1, 2, 4])
+@pytest.mark.parametrize("depth", ["list", "key", "array state", "chumpy"])
+def test_code_below_the_surface_is_refused_and_not_run(tmp_path: Path, protocol: int, depth: str) -> None:
+    mark = tmp_path / "ran"
+    attack = Attack(os.system, f"touch {mark}")
+    hidden = {
+        "list": [[{"a": (1, [attack])}]],
+        "key": {Attack(os.system, f"touch {mark}"): 1},
+        "array state": Attack(np.array, attack),
+        "chumpy": {"x": {"dterms": attack}},
+    }[depth]
+    path = tmp_path / "nested.pkl"
+    path.write_bytes(pickle.dumps({"v_template": np.zeros((5023, 3)), "notes": hidden}, protocol=protocol))
+    with pytest.raises(UnpickleError, match=r"nested\.pkl: refers to '[\w.]*(system|array)'"):
+        read_arrays(path)
+    assert not mark.exists()
+
+
 @pytest.mark.parametrize(
     ("data", "says"),
     [
+        (b"\x80\x02\x83\x01\x00.", "EXT2"),
+        (b"\x80\x02\x84\x01\x00\x00\x00.", "EXT4"),
+        (b"\x80\x02csubprocess\nPopen\n(X\x04\x00\x00\x00echot\x81.", "Popen"),
+        (b"\x80\x04\x8c\x02os\x8c\x06system\x93)}\x92.", "os.system"),
+        (b"\x80\x04\x8c\x05numpy\x8c\x0endarray.tofile\x93.", "ndarray.tofile"),
+        (b"\x80\x02cnumpy.core.multiarray\n_reconstruct\nK\x01\x85R.", "unknown class"),
         (b"\x80\x02Vid\nQ.", "BINPERSID"),
         (b"Pid\n.", "PERSID"),
         (b"\x80\x02\x82\x01.", "EXT1"),
