@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from uika.checking_commands import Doctor, Weights
 from uika.errors import UikaError
 from uika.evaluate_command import Evaluate
 from uika.export_command import Export
@@ -16,6 +17,7 @@ from uika.files import check_folder, check_output
 from uika.motion_commands import Head, Track
 from uika.synthesize_command import Synthesize
 from uika.train_command import Train
+from uika.verify_command import Verify
 
 if TYPE_CHECKING:
     from uika.head import HeadModel
@@ -40,15 +42,18 @@ class Reconstruct:
     """tiny, none, or a trained model file."""
     refine: bool = False
     """Refine face shape and poses with the colours that two or more photos share."""
+    consent: bool = False
+    """State in the avatar's provenance that the person shown agrees."""
 
     def run(self) -> int:
         """Reconstruct and save."""
         target = check_output(self.output, ".safetensors")
         _check_photos(self.photos)
         from uika.reconstruction import reconstruct
+        from uika.safeguards import stamped
 
         result = reconstruct(self.photos, model=self.model, refine=self.refine)
-        result.avatar.save(target)
+        stamped(result.avatar, consent=self.consent).save(target)
         _print_seconds(result.report)
         if self.refine:
             print(f"refined: {result.fit.gain or 'needs two or more photos'}")
@@ -77,6 +82,8 @@ class Animate:
     """Side of the picture in pixels, even."""
     fps: float | None = None
     """Frames per second; 25 or the motion file's own if left out."""
+    watermark: bool = True
+    """Mark the frames invisibly as rendered; `uika verify` finds it."""
 
     def run(self) -> int:
         """Render and encode."""
@@ -86,6 +93,7 @@ class Animate:
         from uika.filming import film
         from uika.head import load_head
         from uika.rendering import check_renderer, check_view
+        from uika.safeguards import mark, picture_provenance
         from uika.video import check_even, write_video
 
         check_view(0.0, 0.0, check_even(self.size))
@@ -97,7 +105,9 @@ class Animate:
         check_renderer()
         if self.video is not None:
             motion = self._tracked(self.video, head)
-        count = write_video(target, film(avatar, motion, head=head, size=self.size, progress=True), motion.fps)
+        pictures = film(avatar, motion, head=head, size=self.size, progress=True)
+        marked = map(mark, pictures) if self.watermark else pictures
+        count = write_video(target, marked, motion.fps, picture_provenance(avatar, watermark=self.watermark))
         print(f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second")
         return 0
 
@@ -127,6 +137,8 @@ class Render:
     """Degrees; positive looks from above."""
     size: int = 512
     """Side of the picture in pixels."""
+    watermark: bool = True
+    """Mark the picture invisibly as rendered; `uika verify` finds it."""
 
     def run(self) -> int:
         """Render and save."""
@@ -134,6 +146,7 @@ class Render:
         from uika.avatar import Avatar
         from uika.head import HeadParameters, load_head
         from uika.rendering import check_renderer, check_view, neutral_camera, render
+        from uika.safeguards import mark, picture_provenance
         from uika.video import write_png
 
         check_view(self.yaw, self.pitch, self.size)
@@ -141,7 +154,9 @@ class Render:
         avatar.check_head(head)
         check_renderer()
         camera = neutral_camera(avatar, self.yaw, self.pitch, self.size)
-        write_png(target, render(avatar, HeadParameters.zeros(head), camera, head).rgb)
+        rgb = render(avatar, HeadParameters.zeros(head), camera, head).rgb
+        marked = mark(rgb) if self.watermark else rgb
+        write_png(target, marked, picture_provenance(avatar, watermark=self.watermark))
         print(f"wrote {target}: {self.size}x{self.size} pixels")
         return 0
 
@@ -155,6 +170,8 @@ class Demo:
 
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out/demo")
     """The folder for avatar.safetensors, talk.mp4 and sheet.png."""
+    watermark: bool = True
+    """Mark video and sheet invisibly as rendered; `uika verify` finds it."""
 
     def run(self) -> int:
         """Do everything once, on one photo."""
@@ -166,64 +183,27 @@ class Demo:
         from uika.head import load_head
         from uika.reconstruction import reconstruct
         from uika.rendering import check_renderer
+        from uika.safeguards import mark, picture_provenance, stamped
         from uika.sheet import reconstruction_sheet
         from uika.video import write_png, write_video
 
         check_renderer()
         head = load_head()
         result = reconstruct([PORTRAIT], head)
-        result.avatar.save(avatar_file)
+        avatar = stamped(result.avatar, consent=False)
+        avatar.save(avatar_file)
+        known = picture_provenance(avatar, watermark=self.watermark)
         with result.report.stage("sheet"):
-            write_png(picture, reconstruction_sheet(result, head))
+            sheet = reconstruction_sheet(result, head)
+            write_png(picture, mark(sheet) if self.watermark else sheet, known)
         with result.report.stage("video"):
             motion = get_motion("talk", head)
-            write_video(video, film(result.avatar, motion, head=head, progress=True), motion.fps)
+            pictures = film(avatar, motion, head=head, progress=True)
+            write_video(video, map(mark, pictures) if self.watermark else pictures, motion.fps, known)
         _print_seconds(result.report)
         for path in (avatar_file, picture, video):
             print(f"wrote {path}")
         return 0
-
-
-@dataclass(frozen=True)
-class Doctor:
-    """Show versions, LLVM, threads and what is missing; exit 1 if something needed is.
-
-    Example: uika doctor
-    """
-
-    def run(self) -> int:
-        """Print the findings."""
-        from uika.doctor import examine
-
-        findings = examine()
-        for finding in findings:
-            print(f"{finding.subject:<12} {finding.value}")
-            if finding.remedy and finding.value in ("missing", "unusable"):
-                print(f"{'':<12} {'needed' if finding.needed else 'optional'}: {finding.remedy}")
-        return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
-
-
-@dataclass(frozen=True)
-class Weights:
-    """List the pretrained weight files: purpose, licence, source, place, and whether what lies there is whole.
-
-    Example: uika weights
-    """
-
-    verify: bool = True
-    """Compare digests, which reads the files whole."""
-
-    def run(self) -> int:
-        """Print the list; nothing is fetched."""
-        from uika.weights import FOLDER_VARIABLE, check_weights, folder
-
-        print(f"weights lie in {folder()} ({FOLDER_VARIABLE} names another folder); nothing is fetched by itself")
-        found = check_weights(verify=self.verify)
-        for status in found:
-            file = status.file
-            print(f"\n{file.name}  {status.state}  {file.gigabytes:g} GB")
-            print(f"  for      {file.purpose}\n  licence  {file.licence}\n  from     {file.source}")
-        return int(any(status.state == "damaged" for status in found))
 
 
 @dataclass(frozen=True)
@@ -260,6 +240,7 @@ Command = (
     | Track
     | Render
     | Export
+    | Verify
     | Demo
     | Head
     | Train

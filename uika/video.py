@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
@@ -29,20 +30,25 @@ def to_bytes(rgb: Picture) -> NDArray[np.uint8]:
     return (rgb.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
-def write_png(path: str | Path, rgb: Tensor) -> None:
-    """Write an image [H,W,3] in [0,1].
+def write_png(path: str | Path, rgb: Tensor, provenance: Mapping[str, str] | None = None) -> None:
+    """Write an image [H,W,3] in [0,1], with `provenance` as JSON in a text chunk of that name.
 
     Raises:
         UikaError: the name does not end in .png, or nothing can be written there.
     """
-    from PIL import Image
+    from PIL import Image, PngImagePlugin
 
     target = check_output(path, ".png")
+    text = PngImagePlugin.PngInfo()
+    if provenance:
+        text.add_itxt("provenance", json.dumps(dict(provenance)))
     with replacing(target) as temporary:
-        Image.fromarray(to_bytes(rgb)).save(temporary)
+        Image.fromarray(to_bytes(rgb)).save(temporary, pnginfo=text)
 
 
-def write_video(path: str | Path, pictures: Iterable[Picture], fps: float) -> int:
+def write_video(
+    path: str | Path, pictures: Iterable[Picture], fps: float, provenance: Mapping[str, str] | None = None
+) -> int:
     """Write images [H,W,3] in [0,1], or as bytes, as H.264 in an MP4 that every player opens.
 
     The encoder works in a thread of its own while the next pictures are made.
@@ -51,6 +57,7 @@ def write_video(path: str | Path, pictures: Iterable[Picture], fps: float) -> in
         path: the file; it must end in .mp4.
         pictures: images of one size with an even number of rows and columns, taken one at a time.
         fps: frames per second.
+        provenance: kept as JSON in the file's comment.
 
     Returns:
         The number of frames.
@@ -68,6 +75,8 @@ def write_video(path: str | Path, pictures: Iterable[Picture], fps: float) -> in
         ThreadPoolExecutor(1) as encoder,
     ):
         pending: deque[Future[None]] = deque()
+        if provenance:
+            container.metadata["comment"] = json.dumps(dict(provenance))
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": _QUALITY}

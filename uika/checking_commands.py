@@ -1,0 +1,47 @@
+"""The commands that look at what is installed; each dataclass is one command's arguments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, LLVM, threads and what is missing; exit 1 if something needed is.
+
+    Example: uika doctor
+    """
+
+    def run(self) -> int:
+        """Print the findings."""
+        from uika.doctor import examine
+
+        findings = examine()
+        for finding in findings:
+            print(f"{finding.subject:<12} {finding.value}")
+            if finding.remedy and finding.value in ("missing", "unusable"):
+                print(f"{'':<12} {'needed' if finding.needed else 'optional'}: {finding.remedy}")
+        return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
+
+
+@dataclass(frozen=True)
+class Weights:
+    """List the pretrained weight files: purpose, licence, source, place, and whether what lies there is whole.
+
+    Example: uika weights
+    """
+
+    verify: bool = True
+    """Compare digests, which reads the files whole."""
+
+    def run(self) -> int:
+        """Print the list; nothing is fetched."""
+        from uika.weights import FOLDER_VARIABLE, check_weights, folder
+
+        print(f"weights lie in {folder()} ({FOLDER_VARIABLE} names another folder); nothing is fetched by itself")
+        found = check_weights(verify=self.verify)
+        for status in found:
+            file = status.file
+            print(f"\n{file.name}  {status.state}  {file.gigabytes:g} GB")
+            print(f"  for      {file.purpose}\n  licence  {file.licence}\n  from     {file.source}")
+        return int(any(status.state == "damaged" for status in found))
