@@ -136,4 +136,5 @@ def _box(camera: Camera, subject: torch.Tensor) -> Box:
     low = torch.minimum((xy.amin(0) - 1).floor().long().clamp_min(0), limit)
     high = torch.minimum((xy.amax(0) + 1).ceil().long().clamp_min(0), limit)
     (x0, y0), (width, height) = low.tolist(), (high - low).tolist()
-    return (x0, y0, width, height) if width > 0 and height > 0 else (0, 0, 0, 0)
+    # One pixel that sees nothing, since Dr.Jit has no use for empty arrays.
+    return (x0, y0, width, height) if width > 0 and height > 0 else (0, 0, 1, 1)

@@ -1,10 +1,12 @@
 import hashlib
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +125,44 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
     with pytest.raises(UikaError, match="file"):
         synthesize(settings(tmp_path / "file"), progress=False)
     assert np.array_equal([path.name for path in tmp_path.iterdir()], ["file"])
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 400 KiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    made = shutil.which("mount") and subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=400k", "none", str(place)], capture_output=True
+    )
+    if not made or made.returncode:
+        pytest.skip("skipped: a small file system needs the right to mount one")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_a_full_disk_is_named_and_the_set_completed_later(made: Path, small_disk: Path) -> None:
+    with pytest.raises(UikaError, match=f"{small_disk}: the disk is full; free space and run the same command again"):
+        synthesize(settings(small_disk), progress=False)
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    complete = [path.name for path in (small_disk / "captures").iterdir() if not path.name.startswith(".")]
+    assert len(complete) < 2
+    synthesize(settings(small_disk), progress=False)
+    assert hashes(small_disk) == hashes(made)
+
+
+def test_a_file_too_large_is_named(made: Path, tmp_path: Path) -> None:
+    code = (
+        "import resource, signal, sys; from pathlib import Path; from uika.data import Synthesis, synthesize\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (60000, 60000))\n"
+        "synthesize(Synthesis(Path(sys.argv[1]), 2, views=3, frames=2, size=64, seed=5), progress=False)"
+    )
+    run = subprocess.run([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 1 and f"UikaError: {tmp_path}: writing failed" in run.stderr
+    assert not list((tmp_path / "shards").glob("*.tar"))
+    synthesize(settings(tmp_path), progress=False)
+    assert hashes(tmp_path) == hashes(made)
 
 
 @pytest.mark.slow
