@@ -54,14 +54,19 @@ def _laplacian_stencil(image: NDArray[np.float64], free: NDArray[np.bool_]) -> S
     for row, column in OFFSETS:
         touched[1:-1, 1:-1] |= free[1 + row : height - 1 + row, 1 + column : width - 1 + column]
     centre = np.stack(np.nonzero(touched))
-    pixels = [(centre[0] + row, centre[1] + column) for row, column in OFFSETS]
-    colours = np.stack([image[pixel] for pixel in pixels], axis=1)  # [N,9,3]
+    middle = np.ravel_multi_index((centre[0], centre[1]), free.shape)
+    pixels = [middle + row * width + column for row, column in OFFSETS]
+    colours = image.reshape(-1, 3)[np.stack(pixels, axis=1)]  # [N,9,3]
     colours -= colours.mean(axis=1, keepdims=True)
-    covariance = np.einsum("nai,naj->nij", colours, colours) / 9 + EPSILON / 9 * np.eye(3)
-    affinity = (1 + colours @ np.linalg.solve(covariance, colours.swapaxes(1, 2))) / 9  # [N,9,9]
+    across = colours.swapaxes(1, 2)
+    covariance = across @ colours / 9 + EPSILON / 9 * np.eye(3)
+    affinity = np.ascontiguousarray(((1 + colours @ np.linalg.solve(covariance, across)) / 9).transpose(1, 2, 0))
     stencil: Stencil = {}
     for a, (row_a, column_a) in enumerate(OFFSETS):
-        for b, (row_b, column_b) in enumerate(OFFSETS):
+        for b, (row_b, column_b) in enumerate(OFFSETS[a:], start=a):
             weights = stencil.setdefault((row_b - row_a, column_b - column_a), np.zeros((height, width)))
-            weights[pixels[a]] += (a == b) - affinity[:, a, b]
+            weights.reshape(-1)[pixels[a]] += float(a == b) - affinity[a, b]
+    # The Laplacian is symmetric: a pixel's weight towards a neighbour is the neighbour's towards the pixel.
+    for (row, column), weights in list(stencil.items()):
+        stencil[-row, -column] = np.roll(weights, (row, column), (0, 1))
     return stencil
