@@ -43,9 +43,8 @@ def test_smooth_errors_earn_less_trust_than_noise(head: HeadModel) -> None:
     noise = random.normal(size=marks.shape)
     place = marks / np.ptp(marks[model.ids], axis=0)
     smooth = np.stack((np.sin(9 * place[:, 1]), np.cos(8 * place[:, 0])), -1)
-    trust = {
-        name: landmark_trust(model, {0: pose}, {0: marks + error}) for name, error in (("n", noise), ("s", smooth))
-    }
+    errors = {"noise": noise, "smooth": smooth}
+    trust = {name: landmark_trust(model, {0: pose}, {0: marks + error}) for name, error in errors.items()}
     assert trust["noise"] > 1
     assert trust["smooth"] < 0.1 * trust["noise"]
     half = landmark_trust(model, {0: pose}, {0: marks + noise / 2})

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from uika.correspondence.detector import unbiased
 from uika.correspondence.hair import fit_hair
 from uika.correspondence.landmarks import fit_landmarks
 from uika.correspondence.refine import Gain, refine_landmark_fit
@@ -68,6 +69,7 @@ def fit_photos(
         raise ValueError(f"photos: all crops must have one size, got {sorted(sizes)}")
     height, width = sizes.pop()
     landmarks = torch.stack([photo.landmarks for photo in photos])
+    landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width), head)
     found, gain = fit_landmarks(landmarks, head, width), None
     if images is not None:
         found, gain = refine_landmark_fit(found, images, landmarks, head)

@@ -1,0 +1,67 @@
+"""The detector's expected error is taken out in the head's own frame."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from uika.correspondence import fit_landmarks
+from uika.correspondence.detector import detector_bias, unbiased, upright, view_polynomials
+from uika.correspondence.landmarks import LandmarkFit, eye_distance
+from uika.head import HeadModel, load_head, look_at, project
+
+SIZE = 512
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+def seen(head: HeadModel, yaw: float) -> tuple[Tensor, Tensor, float]:
+    """Exact landmarks [478,2] of the mean head, the rotation to the camera, and pixels of one eye-corner distance."""
+    camera = look_at(yaw, 4.0, 1.1, fov_y=20.0, size=SIZE)
+    marks = torch.full((478, 2), SIZE / 2)
+    marks[head.landmark_ids] = project(head.landmarks(head.template), camera)[0]
+    return marks, camera.viewmat[:3, :3].double(), float(camera.K[0, 0]) * eye_distance(head) / 1.1
+
+
+def test_frontal_detections_stay_as_they_are(head: HeadModel) -> None:
+    marks, _, unit = seen(head, 0.0)
+    corrected = unbiased(marks[None], fit_landmarks(marks[None], head, SIZE), head)[0]
+    assert float((corrected - marks).norm(dim=-1).mean()) < 0.01 * unit
+
+
+@pytest.mark.parametrize("yaw", [-50.0, 35.0])
+def test_a_biased_detection_is_set_right(head: HeadModel, yaw: float) -> None:
+    marks, rotation, unit = seen(head, yaw)
+    expected = torch.einsum("nf,flc->nlc", view_polynomials(-rotation[None, 2]), detector_bias())[0]
+    wrong = marks + (unit * expected @ upright(rotation[None])[0]).float()
+    corrected = unbiased(wrong[None], fit_landmarks(wrong[None], head, SIZE), head)[0]
+    at = head.landmark_ids
+    before, after = ((m - marks)[at].norm(dim=-1).mean() for m in (wrong, corrected))
+    assert before > 0.01 * unit
+    assert after < 0.3 * before
+
+
+def test_the_correction_turns_with_the_picture(head: HeadModel) -> None:
+    marks, rotation, _ = seen(head, 30.0)
+    angle = math.radians(40)
+    turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    roll = torch.eye(3).double()
+    roll[:2, :2] = turn
+    fits = [
+        LandmarkFit(
+            torch.zeros(1),
+            torch.zeros(1, 1),
+            r[None],
+            torch.tensor([[0.0, 0.0, 1.1]]),
+            torch.ones(1) * 1400,
+            torch.zeros(1),
+        )
+        for r in (rotation, roll @ rotation)
+    ]
+    straight, rolled = (unbiased(marks[None], fit, head)[0] - marks for fit in fits)
+    assert torch.allclose(straight @ turn.mT, rolled, atol=1e-3)
+    assert float(straight.norm(dim=-1).max()) > 1.0
