@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import scenes
+from benchmarks.chart import line_chart
 from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
@@ -31,10 +32,22 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     result = {"quality": quality(options.size, options.reference), "memory": memory(options.renders)}
-    (options.output / "mitsuba.json").write_text(json.dumps(result, indent=1))
+    (options.output / "mitsuba_spp.json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(result, options.renders, options.output)
     for row in result["quality"]:
         print("{method:>10} {spp:5d} spp {seconds:8.3f} s {cpu:8.3f} cpu s  rmse {rmse:.5f}".format(**row))
     print("resident MB:", result["memory"])
+
+
+def draw(result: dict[str, list], renders: int, folder: Path) -> None:
+    """Charts of error over time and of memory over renders."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for row in result["quality"]:
+        lines.setdefault(row["method"], []).append((row["cpu"], row["rmse"]))
+    (folder / "mitsuba_error.svg").write_text(line_chart(lines, "processor seconds", "sRGB error"))
+    step = max(1, renders // len(result["memory"]))
+    curve = [(step * (k + 1), value) for k, value in enumerate(result["memory"])]
+    (folder / "mitsuba_memory.svg").write_text(line_chart({"resident": curve}, "renders", "MB"))
 
 
 def quality(size: int, reference_spp: int) -> list[dict[str, object]]:

@@ -17,6 +17,7 @@ from scenes.arrays import aligned
 from scenes.geometry import SeamMesh, cut_seams
 from scenes.people.glasses import Glasses, glasses_topology
 from scenes.variant import load_mitsuba, single_threaded
+from uika.errors import UikaError
 from uika.head import Camera, HeadModel
 
 Light = Literal["studio", "environment", "flat", "side", "portrait"]
@@ -201,7 +202,11 @@ def _write_mesh(mi: Any, positions: np.ndarray, faces: np.ndarray, texcoords: np
     for key, value in arrays.items():
         params[key] = type(params[key])(np.ascontiguousarray(value).ravel())
     params.update()
-    shape.write_ply(str(path))
+    try:
+        shape.write_ply(str(path))
+    except RuntimeError as error:
+        folder = tempfile.gettempdir()
+        raise UikaError(f"{folder}: a temporary mesh cannot be written; free space or set TMPDIR ({error})") from error
 
 
 def _sensor_values(camera: Camera) -> dict[str, float]:
