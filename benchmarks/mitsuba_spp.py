@@ -43,11 +43,13 @@ def draw(result: dict[str, list], renders: int, folder: Path) -> None:
     """Charts of error over time and of memory over renders."""
     lines: dict[str, list[tuple[float, float]]] = {}
     for row in result["quality"]:
-        lines.setdefault(row["method"], []).append((row["cpu"], row["rmse"]))
+        lines.setdefault(row["method"], []).append((round(row["cpu"], 2), row["rmse"]))
     (folder / "mitsuba_error.svg").write_text(line_chart(lines, "processor seconds", "sRGB error"))
     step = max(1, renders // len(result["memory"]))
     curve = [(step * (k + 1), value) for k, value in enumerate(result["memory"])]
-    (folder / "mitsuba_memory.svg").write_text(line_chart({"resident": curve}, "renders", "MB"))
+    (folder / "mitsuba_memory.svg").write_text(
+        line_chart({f"{min(result['memory'])} to {max(result['memory'])} MB": curve}, "renders", "resident")
+    )
 
 
 def quality(size: int, reference_spp: int) -> list[dict[str, object]]:
