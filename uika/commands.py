@@ -18,6 +18,7 @@ from uika.motion_commands import Head, Track
 from uika.synthesize_command import Synthesize
 from uika.train_command import Train
 from uika.verify_command import Verify
+from uika.view_command import View
 
 if TYPE_CHECKING:
     from uika.head import HeadModel
@@ -239,6 +240,7 @@ Command = (
     | Animate
     | Track
     | Render
+    | View
     | Export
     | Verify
     | Demo

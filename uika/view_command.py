@@ -1,0 +1,57 @@
+"""The command that opens the viewer."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from uika.errors import UikaError
+
+
+@dataclass(frozen=True)
+class View:
+    """Show an avatar on a page of this machine and move it with sliders.
+
+    Example: uika view me.safetensors --motion talk
+    """
+
+    avatar: Positional[Path]
+    """The avatar file."""
+    motion: str = "talk"
+    """orbit, talk, expressions or a motion file, to play."""
+    video: Path | None = None
+    """A video to be driven by, instead of a motion."""
+    count: int | None = None
+    """Show at most so many Gaussians."""
+    port: int = 8080
+    """The port on 127.0.0.1; a higher one if it is taken."""
+
+    def run(self) -> int:
+        """Serve until interrupted."""
+        if not 1024 <= self.port <= 65535:
+            raise UikaError(f"port must lie between 1024 and 65535, not {self.port}")
+        from uika.acting import get_motion
+        from uika.avatar import Avatar
+        from uika.export import thinned
+        from uika.head import load_head
+        from uika.rendering import check_renderer
+        from uika.viewer import Viewer
+
+        avatar, head = Avatar.load(self.avatar), load_head()
+        avatar.check_head(head)
+        if self.count is not None:
+            avatar = thinned(avatar, self.count)
+        check_renderer()
+        if self.video is None:
+            motion = get_motion(self.motion, head)
+        else:
+            from uika.tracking import track_video
+
+            motion = track_video(self.video, head, progress=True).motion
+        with Viewer(avatar, head, motion, self.port) as viewer:
+            print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
+            while True:
+                time.sleep(1.0)

@@ -1,0 +1,7 @@
+"""A page on this machine that shows an avatar and moves it live."""
+
+from uika.viewer.controls import Controls
+from uika.viewer.live import LiveSplats
+from uika.viewer.page import Viewer
+
+__all__ = ["Controls", "LiveSplats", "Viewer"]

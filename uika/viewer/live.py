@@ -1,0 +1,86 @@
+"""An avatar as the buffer that the browser's splat node takes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from uika.avatar import Avatar
+from uika.filming import Stage
+from uika.head import HeadModel, HeadParameters, pose_gaussians, shaped_vertices
+
+UNITS = 100.0  # of the page for a metre: covariances in square metres would be too small for half precision
+Paint = Literal["photo", "UV"]
+
+
+class LiveSplats:
+    """Poses an avatar and packs it: 32 bytes for each Gaussian, centre, covariance and colour."""
+
+    def __init__(self, avatar: Avatar, head: HeadModel) -> None:
+        """Prepare; the first pose takes longer because kernels are compiled.
+
+        Raises:
+            AvatarError: the head model is not the avatar's.
+            RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
+        """
+        self._original, self._head = avatar, head
+        self.avatar = avatar
+        self._stage = Stage(avatar, head)
+        self._buffer: NDArray[np.uint32] = np.zeros((len(avatar), 8), np.uint32)
+        self.paint("photo")
+
+    def paint(self, colors: Paint) -> None:
+        """Choose between the avatar's own colours and its place in the atlas (u red, v green)."""
+        shown = self.avatar.colors
+        if colors == "UV":
+            corners = self._head.uvs[self._head.uv_faces[self.avatar.triangle]]
+            uv = (corners * self.avatar.barycentric[..., None]).sum(1)
+            shown = torch.cat((uv, torch.zeros(len(uv), 1)), -1)
+        rgba = torch.cat((shown, self.avatar.opacities[:, None]), -1).clamp(0, 1)
+        self._buffer[:, 7:8] = (rgba * 255).round().byte().numpy().view(np.uint32)
+
+    def reshape(self, identity: Tensor) -> None:
+        """Give the avatar another identity [K]; its Gaussians follow the surface."""
+        first = self._original
+        old = first.canonical_vertices(self._head)
+        rest = HeadParameters.zeros(self._head).replace(identity=identity)
+        new = shaped_vertices(self._head, rest, first.static_offset)
+        binding = (self._head.faces, first.triangle, first.barycentric)
+        means, quats, scales = pose_gaussians(first.means, first.quats, first.scales, old, new, *binding)
+        self.avatar = dataclasses.replace(first, identity=identity, means=means, quats=quats, scales=scales)
+        self._stage = Stage(self.avatar, self._head)
+
+    def pose(self, params: HeadParameters) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+        """The buffer [N,8] and the mesh [V,3] of one pose, in the page's units."""
+        many = dataclasses.replace(
+            params, **{f.name: getattr(params, f.name)[None] for f in dataclasses.fields(params)}
+        )
+        vertices, turn = self._stage.meshes(many)
+        posed = self._stage.rig.pose(vertices[0], turn[0])
+        count = len(self.avatar)
+        means, quats, scales = (
+            array.numpy().reshape(count, size) for array, size in zip(posed, (3, 4, 3), strict=True)
+        )
+        self._buffer[:, :3] = (means * np.float32(UNITS)).view(np.uint32)
+        self._buffer[:, 4:7] = _covariances(quats, scales * np.float32(UNITS)).view(np.uint32)
+        return self._buffer.copy(), vertices[0].numpy() * np.float32(UNITS)
+
+
+def _covariances(quats: NDArray[np.float32], scales: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Upper triangles [N,6] (xx xy xz yy yz zz) of the covariances."""
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    a, b, c = scales.T
+    rows = (
+        (a * (1 - 2 * (y * y + z * z)), b * 2 * (x * y - w * z), c * 2 * (x * z + w * y)),
+        (a * 2 * (x * y + w * z), b * (1 - 2 * (x * x + z * z)), c * 2 * (y * z - w * x)),
+        (a * 2 * (x * z - w * y), b * 2 * (y * z + w * x), c * (1 - 2 * (x * x + y * y))),
+    )
+    result = np.empty((len(quats), 6), np.float16)
+    for place, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        result[:, place] = sum(one * other for one, other in zip(rows[i], rows[j], strict=True))
+    return result
