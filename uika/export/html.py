@@ -36,7 +36,7 @@ def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel
 
     Args:
         path: `.html` file.
-        avatar: the avatar; its size is about 25 bytes for each Gaussian.
+        avatar: the avatar; it takes about 20 bytes for each Gaussian.
         motion: the movement; a camera path in it is left out.
         head: the head model that the avatar was made for.
 
