@@ -56,7 +56,7 @@ class Avatar:
         Raises:
             AvatarError: a tensor does not fit; the message names it.
         """
-        count, vertices = len(self.means), len(self.static_offset)
+        count, vertices = self.means.shape[:1].numel(), self.static_offset.shape[:1].numel()
         shapes: dict[str, tuple[int, ...]] = {
             "identity": (self.identity.numel(),),
             "static_offset": (vertices, 3),
@@ -208,5 +208,7 @@ def _read(path: Path) -> tuple[str, dict[str, str], dict[str, Tensor]]:
             return metadata["head_id"], {str(key): str(value) for key, value in provenance.items()}, tensors
     except SafetensorError as error:
         raise AvatarError(f"{path}: is truncated, damaged or not an avatar file ({error})") from error
-    except (KeyError, json.JSONDecodeError) as error:
+    except AvatarError:
+        raise
+    except (KeyError, ValueError, RecursionError) as error:
         raise AvatarError(f"{path}: has an incomplete header ({error}); make the avatar again") from error

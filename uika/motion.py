@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.arrays import ArraysError, read_npz
 from uika.errors import UikaError
 from uika.files import check_output, replacing
 from uika.head import HeadModel, HeadParameters
@@ -110,10 +109,9 @@ def load_motion(path: str | Path, head: HeadModel) -> Motion:
     if not source.is_file():
         raise MotionError(f"{source}: no such motion file")
     try:
-        with source.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(f"{source}: cannot be read as an .npz of plain arrays") from error
+        arrays = read_npz(source)
+    except ArraysError as error:
+        raise MotionError(f"{source}: cannot be read as an .npz of plain arrays ({error})") from error
     try:
         return _from_arrays(arrays, head)
     except MotionError as error:

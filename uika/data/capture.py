@@ -72,7 +72,7 @@ def open_capture(path: str | Path, strict: bool = False) -> Capture:
     folder = Path(path)
     description = folder / DESCRIPTION
     try:
-        content = json.loads(description.read_text())
+        content = json.loads(description.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{description}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
@@ -105,9 +105,14 @@ def _frame(folder: Path, entry: Any, number: int) -> Frame:
     for name in _FILES:
         if (value := entry.get(name)) is None:
             continue
-        if not isinstance(value, str) or not (root / value).resolve().is_relative_to(root):
+        try:
+            inside = isinstance(value, str) and (root / value).resolve().is_relative_to(root)
+            found = inside and (folder / value).is_file()
+        except (OSError, ValueError) as error:  # too long, or with characters that no path has
+            raise DataError(f"{where}: {name} is no path ({error})") from error
+        if not inside:
             raise DataError(f"{where}: {name} '{value}' leads out of the folder")
-        if not (folder / value).is_file():
+        if not found:
             raise DataError(f"{folder / value}: is missing, but frame {number} needs it")
         files[name] = value
     return parse_frame(entry, files, where, number)
@@ -122,7 +127,7 @@ def parse_frame(entry: dict[str, Any], files: dict[str, str], where: str, number
     try:
         lens = tuple(float(entry[name]) for name in ("fl_x", "fl_y", "cx", "cy"))
         matrix = tuple(tuple(float(value) for value in row) for row in entry["transform_matrix"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where}: the camera is not made of numbers ({error})") from error
     if len(matrix) != 4 or any(len(row) != 4 for row in matrix):
         raise DataError(f"{where}: transform_matrix must be 4x4")

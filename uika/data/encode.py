@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 import zlib
 from typing import Any
 
@@ -14,6 +15,8 @@ from uika.errors import UikaError, install_command
 DEPTH_UNIT = 5e-5  # metres for one step of a stored depth; the largest is 3.28 m
 UV_STEPS = 65534  # of a stored texture coordinate; 0 stands for none
 _LEVEL = 1  # of compression; higher ones cost more time than the rendering
+_FORMATS = ("PNG", "JPEG", "WEBP")
+_MAX_PIXELS = 64_000_000
 _UP = 2  # PNG's line filter "Up"
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -94,9 +97,15 @@ def _open(data: bytes, name: str) -> Any:
     except ImportError as error:
         raise UikaError(f"reading images needs Pillow; run: {install_command('PIL')}") from error
     try:
-        image = Image.open(io.BytesIO(data))
-        image.load()
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of sizes, judged here
+            image = Image.open(io.BytesIO(data), formats=_FORMATS)
+            if image.width * image.height > _MAX_PIXELS:
+                raise UikaError(f"{name}: has {image.width}x{image.height} pixels; {_MAX_PIXELS:,} are the most")
+            image.load()
+    except UikaError:
+        raise
+    except Exception as error:  # decoders meet hostile bytes with many exception types
         raise UikaError(f"{name}: is not a readable image ({error})") from error
     return image
 

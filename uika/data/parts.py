@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.arrays import ArraysError, read_npz
 from uika.data.encode import decode_colour, decode_depth, decode_mask, decode_uv
 from uika.data.sample import DataError, Sample
 from uika.errors import UikaError
@@ -75,6 +73,8 @@ def build_sample(
         parameters = _parameters({**own, **canonical}, names["flame_param_path"])
         arrays = {**own, **arrays}
     offset = arrays.get("static_offset")
+    if offset is not None and offset.size % 3:
+        raise DataError(f"{where}: array 'static_offset' has the shape {offset.shape}, not [V,3]")
     return Sample(
         key=f"{identity}_{frame.timestep:05d}_{frame.camera_id}",
         identity=identity.partition("_")[0],
@@ -82,7 +82,7 @@ def build_sample(
         camera_id=frame.camera_id,
         image=torch.from_numpy(image).permute(2, 0, 1).float() / 255,
         mask=torch.from_numpy(mask).float() / 255,
-        camera=_camera(frame, *size),
+        camera=_camera(frame, size[0], size[1], where),
         parameters=parameters,
         static_offset=None if offset is None else torch.from_numpy(offset.astype(np.float32)).reshape(-1, 3),
         **labels,
@@ -96,10 +96,9 @@ def read_arrays(data: bytes, name: str) -> dict[str, np.ndarray]:
         DataError: it is not such a file, or an array holds no finite real numbers; the message says `name`.
     """
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{name}: cannot be read as an .npz of plain arrays") from error
+        arrays = read_npz(data)
+    except ArraysError as error:
+        raise DataError(f"{name}: cannot be read as an .npz of plain arrays ({error})") from error
     for key, array in arrays.items():
         if not np.issubdtype(array.dtype, np.number) or not np.isfinite(array).all():
             raise DataError(f"{name}: array '{key}' holds values that are not finite numbers")
@@ -119,12 +118,15 @@ def _parameters(arrays: Mapping[str, np.ndarray], name: str) -> HeadParameters:
     return HeadParameters(row("shape"), row("expr"), translation=row("translation", 3), **pose)
 
 
-def _camera(frame: Frame, height: int, width: int) -> Camera:
+def _camera(frame: Frame, height: int, width: int, where: str) -> Camera:
     to_world = torch.tensor(frame.matrix, dtype=torch.float64)
     to_world[:3, 1:3] *= -1
     fx, fy, cx, cy = frame.lens
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Camera(torch.linalg.inv(to_world).float(), K, width, height)
+    viewmat, failed = torch.linalg.inv_ex(to_world)
+    if int(failed) or not bool(torch.isfinite(viewmat.float()).all()):
+        raise DataError(f"{where}: the transform_matrix of timestep {frame.timestep} cannot be inverted")
+    return Camera(viewmat.float(), K, width, height)
 
 
 def _same_size(array: np.ndarray, size: tuple[int, ...], name: str) -> None:

@@ -44,8 +44,11 @@ def read_shard(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
     key = ""
     group: dict[str, bytes] = {}
     try:
+        size = source.stat().st_size
         with tarfile.open(source, "r:") as archive:
             for info in archive:
+                if info.issparse() or info.size > size:
+                    raise DataError(f"{source}: promises more than it holds; make it again")
                 stem, _, extension = info.name.partition(".")
                 handle = archive.extractfile(info) if info.isfile() else None
                 if handle is None:
@@ -57,7 +60,9 @@ def read_shard(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                 group[extension] = handle.read()
                 if len(group[extension]) != info.size:
                     raise DataError(f"{source}: is truncated; make it again")
-    except (OSError, tarfile.TarError) as error:
+    except DataError:
+        raise
+    except (OSError, EOFError, ValueError, OverflowError, tarfile.TarError) as error:
         raise DataError(f"{source}: is not a readable shard ({error})") from error
     if group:
         yield key, group
@@ -85,7 +90,7 @@ def _sample(key: str, group: dict[str, bytes], canonical: dict[str, np.ndarray],
     name = f"{where}/{key}.json"
     try:
         entry = json.loads(group["json"])
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise DataError(f"{name}: is missing or not complete JSON") from error
     if not isinstance(entry, dict) or "png" not in group:
         raise DataError(f"{where}/{key}: lacks its image or description")

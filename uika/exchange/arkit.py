@@ -97,7 +97,7 @@ def read_json(path: str | Path) -> Motion:
         if not any(set(pose) & set(ARKIT_ACTIONS) for pose in named):
             raise MotionError("names no ARKit actions such as jawOpen")
         return _motion(torch.tensor([[float(pose.get(name, 0.0)) for name in ARKIT_ACTIONS] for pose in named]), fps)
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise MotionError(f"{place}: {error}") from error
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from uika.arrays import ArraysError, read_npz
 from uika.files import check_output, replacing
 from uika.motion import Motion, MotionError
 
@@ -79,10 +79,10 @@ def _arrays(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise MotionError(f"{path}: no such motion file")
     try:
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            found = {name: file[other] for name, other in _NAMES.items() if other in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(f"{path}: cannot be read as an .npz of plain arrays") from error
+        arrays = read_npz(path, _NAMES.values())
+    except ArraysError as error:
+        raise MotionError(f"{path}: cannot be read as an .npz of plain arrays ({error})") from error
+    found = {name: arrays[other] for name, other in _NAMES.items() if other in arrays}
     if "expression" not in found:
         raise MotionError(f"{path}: lacks the array 'expr', so it holds no FLAME parameters")
     for name, array in found.items():

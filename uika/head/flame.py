@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.arrays import ArraysError, read_npy, read_npz
 from uika.head.model import JOINT_PARENTS, HeadError, HeadModel
 from uika.head.unpickle import UnpickleError, read_arrays
 
@@ -93,9 +93,8 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
         raise HeadError(f"{source}: no such model file; FLAME models come from https://flame.is.tue.mpg.de")
     if zipfile.is_zipfile(source):
         try:
-            with source.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+            return read_npz(source)
+        except ArraysError as error:
             raise HeadError(f"{source}: cannot be read as an .npz of plain arrays: {error}") from error
     if source.suffix == ".npz":
         raise HeadError(f"{source}: is damaged or no .npz file; fetch it again")
@@ -169,10 +168,9 @@ def _index(word: str, count: int) -> int:
 
 def _read_offset(path: Path) -> Tensor:
     try:
-        with path.open("rb") as handle:
-            offset = np.load(handle, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise HeadError(f"{path}: cannot be read as an .npy of numbers") from error
+        offset = read_npy(path)
+    except ArraysError as error:
+        raise HeadError(f"{path}: cannot be read as an .npy of numbers ({error})") from error
     if offset.reshape(-1, 3).shape != (VERTICES, 3):
         raise HeadError(f"{path}: has shape {offset.shape}; eyelids need ({VERTICES}, 3)")
     return _real(offset.reshape(-1, 3))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -15,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+
+from uika.arrays import ArraysError, read_npz
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 JOINT_PARENTS = (-1, 0, 1, 1, 1)
@@ -167,10 +167,8 @@ def content_hash(arrays: Mapping[str, np.ndarray]) -> str:
 @lru_cache(maxsize=4)
 def _load(path: Path, modified: int, size: int) -> HeadModel:
     try:
-        # An own handle: numpy leaves the one it opens itself unclosed when the archive is damaged.
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = read_npz(path)
+    except ArraysError as error:
         raise HeadError(f"head file {path} cannot be read as an .npz of plain arrays: {error}") from error
     try:
         if "sha256" in arrays and content_hash(arrays) != str(arrays["sha256"]):

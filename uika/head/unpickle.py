@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-MAX_BYTES = 2 << 30
+MAX_BYTES = 1 << 29  # of a file, and of all arrays in it; FLAME's take a fifth
 _MAX_MEMO = 10_000_000  # the unpickler allocates as many slots as the largest memo index asks for
-_MAX_DENSE = 1 << 28  # entries of a sparse matrix
+_MAX_DENSE = 1 << 22  # entries of a sparse matrix; a joint regressor has 25 thousand
 _REFUSED_OPCODES = {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
 _SPARSE = ("csc_matrix", "csr_matrix")
 
@@ -175,7 +175,12 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
         content = _Unpickler(io.BytesIO(data), encoding="latin1").load()
         if not isinstance(content, dict):
             raise UnpickleError(f"holds a {type(content).__name__} where a dictionary of arrays is expected")
-        named = {str(key): _plain(value) for key, value in content.items()}
+        named, total = {}, 0
+        for key, value in content.items():
+            named[str(key)] = _plain(value)
+            total += getattr(named[str(key)], "nbytes", 0)
+            if total > MAX_BYTES:  # the same stored array may be named a thousand times
+                raise UnpickleError(f"holds more than {MAX_BYTES >> 20} MiB of arrays")
     except UnpickleError as error:
         raise UnpickleError(f"{source}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way, the file's only effect is this error
@@ -242,6 +247,8 @@ def _dense(record: _Sparse) -> np.ndarray:
     data, indices, indptr = (_plain(state[name]) for name in ("data", "indices", "indptr"))
     if len(shape) != 2 or shape[0] * shape[1] > _MAX_DENSE:
         raise UnpickleError(f"holds a sparse matrix of shape {shape}; larger than a head model needs")
+    if len(data) != len(indices) or len(indptr) < 1 or int(indptr[-1]) != len(data) or (np.diff(indptr) < 0).any():
+        raise UnpickleError("holds a sparse matrix whose columns and values do not fit together")
     major = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
     matrix = np.zeros(tuple(int(n) for n in shape), data.dtype)
     place = (indices, major) if isinstance(record, _Columns) else (major, indices)
