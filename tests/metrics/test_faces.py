@@ -40,7 +40,7 @@ def distances(first: torch.Tensor, second: torch.Tensor) -> tuple[float, float, 
 
 
 def test_equal_faces_have_no_distance() -> None:
-    assert distances(face(0.3, 0.2), face(0.3, 0.2)) == (0.0, 0.0, 0.0)
+    assert distances(face(0.3, 0.2), face(0.3, 0.2)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_distances_rise_with_the_expression() -> None:
