@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache, wraps
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 
@@ -13,8 +15,11 @@ from .llvm import require
 if TYPE_CHECKING:
     import torch
 
+F = TypeVar("F", bound=Callable[..., Any])
+
 TILE = 4  # pixels along each side of the tile that one SIMD lane renders
 PIXELS = TILE * TILE
+RECORDINGS = 64  # image sizes and modes whose traced kernels are kept
 # Least-squares fits with weights pushed towards equal relative errors of 2**x on [-1/2, 1/2], highest power first;
 # the errors are 7.5e-8, 4e-6 and 1e-4.
 _EXP2 = {
@@ -146,6 +151,32 @@ def exp2(be: Backend, x: Any, degree: int = 5) -> Any:
     for coefficient in rest:
         value = dr.fma(value, f, coefficient)
     return dr.reinterpret_array(J.Float, dr.reinterpret_array(J.Int32, value) + (J.Int32(whole) << 23))
+
+
+_turn = threading.RLock()
+
+
+def exclusive(function: F) -> F:
+    """`function` for one thread at a time: Dr.Jit mixes up what several threads trace and differentiate at once."""
+
+    @wraps(function)
+    def waiting(*arguments: Any, **named: Any) -> Any:
+        with _turn:
+            return function(*arguments, **named)
+
+    return cast(F, waiting)
+
+
+def recorded(run: Callable[..., Any]) -> Callable[..., Any]:
+    """`run`, which takes and returns arrays, traced at the first call and repeated from then on."""
+
+    # Dr.Jit walks over everything that a frozen function's own closure names, and holds its lock meanwhile. Were there
+    # a dataclass among it, the walk would run Python code, another thread could take over, and both would wait forever.
+    @dr.freeze(state_fn=None, warn_after=RECORDINGS)
+    def kernel(*arrays: Any) -> Any:
+        return run(*arrays)
+
+    return kernel
 
 
 def power_of_two(n: int) -> int:

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 
-from ._backend import PIXELS, TILE, Backend, bits_of, exp2, packet, power_of_two, smaller, write
+from ._backend import (
+    PIXELS,
+    RECORDINGS,
+    TILE,
+    Backend,
+    bits_of,
+    exp2,
+    packet,
+    power_of_two,
+    recorded,
+    smaller,
+    write,
+)
 from ._lists import TileLists, lane_order
 from ._project import RECORD
 from ._settings import Settings
@@ -165,6 +178,27 @@ class Blended:
 
 def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> Blended:
     """Blend `features` features of each record, front to back."""
+    kernel = _recorded(be, features, lists.columns, lists.rows, settings)
+    image, left, end = kernel(records, lists.ids, lists.start, lists.order)
+    return Blended(image, left, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))
+
+
+@lru_cache(maxsize=RECORDINGS)
+def _recorded(be: Backend, features: int, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
+    """The kernel of one image size and mode, traced at its first call.
+
+    Tracing takes longer than rendering a small image. Repeating a trace is sound here because every size in the kernel
+    comes from these arguments; arrays of other lengths are only read.
+    """
+
+    def run(records: Any, ids: Any, start: Any, order: Any) -> tuple[Any, Any, Any]:
+        return _blend(be, records, TileLists(ids, start, order, columns, rows), features, settings)
+
+    return recorded(run)
+
+
+def _blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> tuple[Any, Any, Any]:
+    """Features [H * W * F], transmittance [H * W] and loop ends [tiles]."""
     J = be.plain
     tile = tile_of(be, lists.order, lists, settings)
     pixels = tile.pixels()
@@ -209,4 +243,4 @@ def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: 
     end = dr.empty(J.UInt32, lists.tiles)
     write(end, smaller(k, tile.last), tile.index, tile.used)
     dr.eval(image, left, end)
-    return Blended(image, left, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))
+    return image, left, end

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 
-from ._backend import TILE, Backend, add_packet, packet, power_of_two
+from ._backend import RECORDINGS, TILE, Backend, add_packet, packet, power_of_two, recorded
 from ._blend import (
     Blended,
     clamped_alpha,
@@ -33,11 +35,49 @@ def blend_backward(
     features: int,
     grad_features: Any,  # [H * W * F]
     grad_coverage: Any | None,  # [H * W]
-    gradients: Any,  # [>= N * RECORD], added to
+    capacity: int,
+    settings: Settings,
+) -> Any:
+    """One chunk's gradients [capacity * RECORD], `capacity` >= N, laid out like the records: a splat's moments and then
+    those of its features share a cache line.
+    """
+    key = (be, capacity, features, lists.columns, lists.rows, settings, dr.thread_count())
+    arrays = (records, lists.ids, lists.start, blended.features, blended.transmittance, blended.end, blended.order)
+    return _recorded(*key)(*arrays, grad_features, grad_coverage)
+
+
+@lru_cache(maxsize=RECORDINGS)
+def _recorded(
+    be: Backend, capacity: int, features: int, columns: int, rows: int, settings: Settings, threads: int
+) -> Callable[..., Any]:
+    """The kernel, traced at its first call; see `_blend._recorded`. Each thread adds to a copy of its own, so that the
+    number of `threads` is part of the key.
+    """
+
+    def run(
+        records: Any, ids: Any, start: Any, image: Any, left: Any, end: Any, order: Any, grad: Any, grad_left: Any
+    ) -> Any:
+        gradients = dr.zeros(be.plain.Float, capacity * RECORD)
+        lists, blended = TileLists(ids, start, None, columns, rows), Blended(image, left, end, order)
+        _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings)
+        dr.eval(gradients)
+        return gradients
+
+    return recorded(run)
+
+
+def _add_gradients(
+    be: Backend,
+    records: Any,
+    lists: TileLists,
+    blended: Blended,
+    features: int,
+    grad_features: Any,
+    grad_coverage: Any | None,
+    gradients: Any,
     settings: Settings,
 ) -> None:
-    """Add one chunk's gradients to `gradients`, laid out like the records: a splat's moments and then those of its
-    features share a cache line.
+    """Add the gradients to those given.
 
     `behind` starts as the gradient-weighted sum of everything in the pixel and loses each splat as it is passed,
     so that dL/dalpha needs neither a stored state nor a walk from the back:

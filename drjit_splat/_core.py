@@ -154,12 +154,10 @@ def backward(
     grad_colors = dr.empty(J.Float, n * columns) if wanted.colors else None
     for chunk, gradient in zip(trace.chunks, grad_features, strict=True):
         with stage("blend backward"):
-            target = dr.zeros(J.Float, capacity(n) * RECORD)
             coverage = grad_coverage if chunk.first == 0 else None
-            blend_backward(
-                be, chunk.records, lists, chunk.image, chunk.count, gradient, coverage, target, trace.settings
+            target = blend_backward(
+                be, chunk.records, lists, chunk.image, chunk.count, gradient, coverage, capacity(n), trace.settings
             )
-            dr.eval(target)
         sums.append(target)
         size = power_of_two(chunk.count)
         ratio = RECORD // size

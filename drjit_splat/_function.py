@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
-from ._backend import Backend, backend_of, flat
+from ._backend import Backend, backend_of, exclusive, flat
 from ._inputs import check_finite
 from ._project import Arrays
 from ._settings import Settings
@@ -85,6 +85,7 @@ class Splat(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @exclusive
     def backward(ctx: Any, grad_sums: Tensor, grad_coverage: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of the eight tensors."""
         saved = tuple(None if t is None else t.detach().contiguous() for t in ctx.saved_tensors[:8])

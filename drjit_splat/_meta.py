@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._backend import exclusive
 from ._core import Trace
 from ._project import CULLED, RECORD
 
@@ -20,6 +21,7 @@ class Meta(Mapping[str, Any]):
         self._makers = makers
         self._known: dict[str, Any] = {}
 
+    @exclusive
     def __getitem__(self, key: str) -> Any:
         """The value of `key`."""
         if key not in self._known:

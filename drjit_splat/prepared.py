@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
-from ._backend import Backend, backend_of, flat
+from ._backend import Backend, backend_of, exclusive, flat
 from ._function import INPUTS, arrays_of, image_of, split
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
@@ -28,6 +28,7 @@ class Prepared:
     adaptive: bool  # whether the lists hold for any opacities
     traces: tuple[_core.Trace, ...]  # one a camera, without images
 
+    @exclusive
     def shade(
         self, colors: Tensor, opacities: Tensor | None = None, backgrounds: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Meta]:
@@ -68,6 +69,7 @@ class Prepared:
         return stack(images).to(colors.dtype), stack(coverages).to(colors.dtype), meta
 
 
+@exclusive
 def prepare(
     means: Tensor,  # [N, 3]
     quats: Tensor | None,  # [N, 4]
@@ -152,6 +154,7 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @exclusive
     def backward(ctx: Any, grad_sums: Tensor, grad_coverage: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of the colours and opacities; the projection has no adjoint here."""
         colors, opacities = ctx.saved_tensors[:2]

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._backend import exclusive
 from ._compat import check_compatibility
 from ._core import Trace
 from ._function import Splat
@@ -17,6 +18,7 @@ from ._settings import Options, Settings
 from .profiling import stage
 
 
+@exclusive
 def rasterization(
     means: Tensor,  # [N, 3]
     quats: Tensor | None,  # [N, 4]

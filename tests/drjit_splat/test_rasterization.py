@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -182,3 +183,18 @@ def test_editing_an_input_before_backward_is_noticed() -> None:
         colors.mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         image.sum().backward()
+
+
+def test_threads_may_render_at_once() -> None:
+    scenes = [random_scene(count=count, seed=count) for count in (200, 300)]
+
+    def step(scene: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        means = scene["means"].clone().requires_grad_()
+        image = rasterization(**(scene | {"means": means}), width=64, height=64)[0]
+        return image.detach(), torch.autograd.grad(image.square().sum(), means)[0]
+
+    expected = [step(scene) for scene in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        for index, (image, gradient) in enumerate(pool.map(step, scenes * 20)):
+            assert torch.equal(image, expected[index % 2][0])
+            torch.testing.assert_close(gradient, expected[index % 2][1], rtol=1e-4, atol=1e-5)
