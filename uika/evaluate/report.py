@@ -70,7 +70,7 @@ def _protocols(section: Section) -> list[str]:
 def _strips(section: Section) -> Iterator[tuple[str, str]]:
     """Path and caption of the pictures to show: one of each sequence before a second of any."""
     found = [
-        (index, f"{result.sequence}, {row.protocol.method}, {row.views} views, target {result.targets[index]}", path)
+        (index, f"{result.sequence}, {row.protocol.method}, views: {row.views}, target {result.targets[index]}", path)
         for row in section.rows
         for result in row.results
         for index, path in enumerate(result.pictures)

@@ -214,7 +214,7 @@ def _frames(sequence: Sequence, driver: Sequence) -> dict[str, object]:
 def _protocol(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> Protocol:
     external = settings.external is not None
     name = settings.name or (settings.external.name if settings.external else Path(settings.model).stem)
-    model = f"pictures in {name}" if loaded is None else loaded.name
+    model = f"pictures in {name}" if loaded is None else f"model {loaded.name}"
     if loaded is not None and Path(settings.model).is_file():
         model = f"{model}, sha256 {sha256(Path(settings.model))[:12]}"
     return Protocol(

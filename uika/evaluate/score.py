@@ -11,15 +11,7 @@ from torch import Tensor
 from uika.evaluate.protocol import Protocol
 from uika.head import HeadModel
 from uika.lpips import Lpips
-from uika.metrics import (
-    expression_distance,
-    fit_faces,
-    flip,
-    keypoint_distance,
-    pose_distance,
-    psnr,
-    ssim,
-)
+from uika.metrics import expression_distance, fit_faces, flip_map, keypoint_distance, pose_distance, psnr, ssim
 from uika.metrics.arcface import ArcFace, identity_similarity
 from uika.metrics.faces import find_landmarks
 
@@ -97,11 +89,12 @@ def mean(values: Sequence[float | None]) -> float | None:
 
 
 def _picture_scores(image: Tensor, truth: Tensor, mask: Tensor, judges: Judges) -> dict[str, float]:
-    scores = {"PSNR": psnr(image, truth), "SSIM": ssim(image, truth), "FLIP": flip(image, truth)}
+    error = flip_map(image, truth)
+    scores = {"PSNR": psnr(image, truth), "SSIM": ssim(image, truth), "FLIP": float(error.mean())}
     if bool(mask.any()):
         scores["PSNR masked"] = psnr(image, truth, mask)
         scores["SSIM masked"] = ssim(image, truth, mask)
-        scores["FLIP masked"] = flip(image, truth, mask)
+        scores["FLIP masked"] = float(error[mask].mean())
     if judges.lpips is not None:
         with torch.no_grad():
             scores["LPIPS"] = float(judges.lpips(*(each.permute(2, 0, 1)[None] for each in (image, truth))))
