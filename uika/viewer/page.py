@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from uika.avatar import Avatar
@@ -56,6 +57,7 @@ class Viewer:
         self._actions: dict[str, Any] = {}
         self._pose: dict[str, Any] = {}
         self._identity: list[Any] = []
+        self._mesh: Any = None
         self._dirty, self._stopped = threading.Event(), threading.Event()
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
         self._frame, self._began = -1, 0.0
@@ -88,15 +90,14 @@ class Viewer:
         scene, gui = self.server.scene, self.server.gui
         scene.set_up_direction("+y")
         gui.configure_theme(control_layout="fixed", show_share_button=False)
-        buffer, vertices = self.live.pose(self._params)
+        buffer, _ = self.live.pose(self._params)
         count = len(self.live.avatar)
-        white, flat = torch.ones(count, 3).numpy(), torch.zeros(count, 3, 3).numpy()
+        centers = buffer[:, :3].copy().view(np.float32)
+        white, small = np.ones((count, 3)), np.tile(1e-3 * np.eye(3), (count, 1, 1))
         self._splats = scene.add_gaussian_splats(
-            "/avatar", centers=flat[:, 0], covariances=flat, rgbs=white, opacities=white[:, :1]
+            "/avatar", centers=centers, covariances=small, rgbs=white, opacities=white[:, :1]
         )
         self._splats.buffer = buffer
-        faces = self._head.faces.numpy()
-        self._mesh = scene.add_mesh_simple("/mesh", vertices, faces, wireframe=True, color=(40, 40, 40), visible=False)
         camera = neutral_camera(self.live.avatar)
         self._target = torch.quantile(self.live.avatar.means, torch.tensor([0.002, 0.998]), dim=0).mean(0)
         self._distance = float((camera.position - self._target).norm())
@@ -145,7 +146,7 @@ class Viewer:
             colors = gui.add_dropdown("colours", ("photo", "UV"))
             colors.on_update(lambda _: self._jobs.put(lambda: self.live.paint(colors.value)))
             mesh = gui.add_checkbox("mesh", False)
-            mesh.on_update(lambda _: self._jobs.put(lambda: setattr(self._mesh, "visible", mesh.value)))
+            mesh.on_update(lambda _: self._jobs.put(lambda: self._show_mesh(mesh.value)))
         with gui.add_folder("Still", expand_by_default=False):
             button = gui.add_button("Render with drjit_splat")
             self._verdict = gui.add_markdown("")
@@ -169,6 +170,16 @@ class Viewer:
         for slider in (*self._pose.values(), *self._actions.values()):
             slider.value = 0.0
         self._moved()
+
+    def _show_mesh(self, shown: bool) -> None:
+        if self._mesh is not None:
+            self._mesh.remove()
+            self._mesh = None
+        if shown:
+            vertices = self.live.pose(self._params)[1]
+            faces = self._head.faces.numpy().astype(np.uint32)
+            add = self.server.scene.add_mesh_simple
+            self._mesh = add("/mesh", vertices, faces, wireframe=True, color=(40, 40, 40))
 
     def _start(self) -> None:
         if self._motion is not None and self._play is not None and self._play.value:
@@ -209,7 +220,7 @@ class Viewer:
             self._params = self._wanted()
             buffer, vertices = self.live.pose(self._params)
             self._splats.buffer = buffer
-            if self._mesh.visible:
+            if self._mesh is not None:
                 self._mesh.vertices = vertices
             self.updates += 1
 
