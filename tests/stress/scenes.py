@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from tests.drjit_splat.common import random_scene
+from tests.drjit_splat.common import Comparison, random_scene
 
 # Few sizes: each one compiles its own kernels.
 SIZES = ((32, 32), (33, 21))
@@ -87,3 +88,11 @@ def extreme(seed: int) -> Case:
         "render_mode": rng.choice(MODES[:1] + MODES[3:]),
     }
     return Case(scene, width, height, options)
+
+
+def noted(worst: Callable[[str, float], float], c: Comparison) -> Comparison:
+    """The comparison, after its errors were added to the table of the worst."""
+    worst("image", c.image)
+    worst("coverage", c.alpha)
+    worst("gradient", max(c.gradients.values(), default=0.0))
+    return c

@@ -171,7 +171,7 @@ _ENTRY = {
 }
 
 
-def _captures(folder: Path) -> list[Path]:
+def captures(folder: Path) -> list[Path]:
     files = _frame_files()
     for name, key in (("a.png", "png"), ("m.png", "mask.png"), ("uv.png", "uv.png"), ("a.npz", "npz")):
         (folder / name).write_bytes(files[key])
@@ -218,6 +218,6 @@ TARGETS = {
     ),
     "motion_csv": Target(_tables, mutate.text, read_csv, MotionError),
     "motion_json": Target(_poses, mutate.text, read_json, MotionError),
-    "transforms": Target(_captures, mutate.text, _read_capture, DataError),
+    "transforms": Target(captures, mutate.text, _read_capture, DataError),
     "shard": Target(_shards, mutate.tar, _read_shard, DataError),
 }
