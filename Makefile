@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 # Idle OpenMP threads would spin on the cores Dr.Jit needs.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: setup demo test test-all lint format bench docs bake clean
+.PHONY: setup demo test test-all stress lint format bench docs bake clean
 
 setup: $(READY) llvm
 
@@ -26,6 +26,10 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -q
+
+# Ten thousand random scenes, 200 extreme ones, 100,000 damaged files, stopped commands: hours.
+stress: setup
+	UIKA_STRESS=long UIKA_STRESS_TABLE=out/stress.md $(BIN)/python -m pytest -q tests/stress -m "slow or not slow"
 
 test-all: setup
 	$(BIN)/python -m pytest -q -m "slow or not slow"

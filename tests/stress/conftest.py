@@ -45,4 +45,5 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         terminalreporter.write_line(f"{test:<70} {what:<28} {value:.3g}")
     if target := os.environ.get("UIKA_STRESS_TABLE"):
         rows = [f"| `{test}` | {what} | {value:.2g} |" for (test, what), value in sorted(_WORST.items())]
+        Path(target).parent.mkdir(parents=True, exist_ok=True)
         Path(target).write_text("\n".join(["| test | what | worst |", "|---|---|---|", *rows]) + "\n")
