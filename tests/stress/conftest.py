@@ -15,7 +15,7 @@ _WORST: dict[tuple[str, str], float] = {}
 
 settings.register_profile(
     "stress",
-    max_examples=300 if LONG else 8,
+    max_examples=300 if LONG else 5,
     deadline=None,
     derandomize=True,
     database=None,

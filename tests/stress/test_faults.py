@@ -50,7 +50,8 @@ def test_rendering_works(avatar: Path, tmp_path: Path, before: tuple[str, ...], 
     if before and shutil.which(before[0]) is None:
         pytest.skip(f"{before[0]} is not installed")
     code, error = run("render", avatar, "-o", "a.png", "--size", 64, cwd=tmp_path, before=before, **environment)
-    assert (code, error) == (0, "")
+    # Dr.Jit says in one line that it keeps no kernels on disk.
+    assert code == 0 and (not error or (error.startswith("jit_init()") and error.count("\n") == 1)), error
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 

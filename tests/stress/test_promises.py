@@ -71,7 +71,12 @@ def test_the_search_finds_what_it_looks_for() -> None:
     assert len(set(_dangers(ast.parse(code)))) == 5
 
 
-@pytest.mark.parametrize("name", list(TARGETS))
+QUICK = ("photo", "avatar", "shard")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in TARGETS]
+)
 def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
     result = fuzz(name, COUNT, 1, tmp_path)
     assert result.findings == {}

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -35,13 +36,15 @@ def test_07_gradient_through_the_conics_off_diagonal(worst: Worst, seed: int, an
     assert_close(noted(worst, compare(scene, 16, 16)))
 
 
-@given(seed=SEEDS, x=st.floats(-2, 3), y=st.floats(-2, 3))
+@given(seed=SEEDS, x=st.floats(-0.8, 1.8), y=st.floats(-0.8, 1.8))
 def test_10_principal_point_anywhere(worst: Worst, seed: int, x: float, y: float) -> None:
     scene = random_scene(100, 32, 32, seed=seed)
     scene["Ks"][:, 0, 2], scene["Ks"][:, 1, 2] = 32 * x, 32 * y
-    scene["means"][:, 0] += 2.0 * (x - 0.5) / 1.1
-    scene["means"][:, 1] += 2.0 * (y - 0.5) / 1.05
-    assert_close(noted(worst, compare(scene, 32, 32)), gradient=2e-4)
+    scene["means"][:, 0] -= 2.0 * (x - 0.45) / 1.1
+    scene["means"][:, 1] -= 2.0 * (y - 0.57) / 1.05
+    c = noted(worst, compare(scene, 32, 32))
+    assert c.meta["n_visible"][0] > 20
+    assert_close(c, gradient=2e-4)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4, 32])
@@ -95,6 +98,7 @@ def test_27_popping_along_an_orbit_is_no_more_than_a_splat(worst: Worst) -> None
     assert largest < 0.5
 
 
+@pytest.mark.slow
 def test_28_runs_and_numbers_of_threads(worst: Worst) -> None:
     code = (
         "import hashlib, json, sys, torch, drjit as dr; from tests.drjit_splat.common import *;"
@@ -132,7 +136,9 @@ def test_29_gradients_that_are_not_contiguous(seed: int, form: str) -> None:
         rasterization(**leaves, width=32, height=32)[0].backward(gradient)
         found.append({k: v.grad for k, v in leaves.items()})
     for name, gradient in found[0].items():
-        assert gradient is not None and torch.equal(gradient, found[1][name]), name
+        other = found[1][name]
+        assert gradient is not None and other is not None
+        assert float((gradient - other).norm()) <= 1e-6 * float(other.norm()), name
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
@@ -147,6 +153,7 @@ def test_30_nothing_asked_for_keeps_nothing() -> None:
     assert not image.requires_grad and not alpha.requires_grad
 
 
+@pytest.mark.slow
 def test_31_memory_of_an_optimisation_is_flat(worst: Worst) -> None:
     def resident() -> int:
         with open("/proc/self/statm") as file:  # noqa: PTH123
@@ -177,6 +184,16 @@ def test_32_every_input_edited_in_place_is_noticed(name: str) -> None:
         image.sum().backward()
 
 
+def test_an_old_llvm_is_refused_before_it_is_loaded(tmp_path: Path) -> None:
+    library = tmp_path / "libLLVM-14.so.1"
+    library.touch()
+    code = "from drjit_splat.llvm import require; require()"
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(library)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "jit_llvm_init" not in done.stderr
+    assert "is LLVM 14, but 16 or newer is needed" in done.stderr.splitlines()[-1]
+
+
 def test_checkpointed_calls_have_the_same_gradients() -> None:
     scene = random_scene(100, 32, 32)
     names = list(scene)
@@ -203,6 +220,7 @@ class Rendered(torch.utils.data.Dataset[Tensor]):
         return rasterization(**random_scene(30, 16, 16, seed=index), width=16, height=16)[0][0]
 
 
+@pytest.mark.slow
 def test_workers_that_are_spawned_render_the_same() -> None:
     wanted = torch.stack([Rendered()[index] for index in range(4)])
     loader = DataLoader(Rendered(), batch_size=4, num_workers=1, multiprocessing_context="spawn")
