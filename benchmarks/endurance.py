@@ -1,7 +1,7 @@
 """Memory and compiled kernels over thousands of steps and frames with changing numbers of splats and sizes.
 
-`python -m benchmarks.endurance [--steps 2000] [--frames 5000]` writes out/endurance.json; flat numbers after the first pass
-over the sizes are what is wanted.
+`python -m benchmarks.endurance [--steps 2000] [--frames 5000]` writes out/endurance.json; flat numbers after the first
+pass over the sizes are what is wanted.
 """
 
 from __future__ import annotations

@@ -99,9 +99,9 @@ def _npz(header: bytes, packing: int = zipfile.ZIP_DEFLATED, body: bytes = b"") 
         (_npz(b"{'descr': '<U99999999', 'fortran_order': False, 'shape': (21,)}\n"), "more than the file holds"),
         (_npz(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-1,)}\n"), "more than the file holds"),
         (_npz(b"{'descr': '|O', 'fortran_order': False, 'shape': (1,)}\n"), "only numbers and text"),
-        (_npz(b"{'descr': '<f4', 'fortran_order': False, 'shape': (\n"), ""),
+        (_npz(b"{'descr': '<f4', 'fortran_order': False, 'shape': (\n"), "."),
         (_npz(b"{'descr': '<f4'}\n", zipfile.ZIP_LZMA), "does not use"),
-        (b"PK\x03\x04", ""),
+        (b"PK\x03\x04", "."),
     ],
 )
 def test_arrays_promise_no_more_than_they_hold(data: bytes, words: str) -> None:

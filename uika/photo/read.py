@@ -76,7 +76,8 @@ def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[n
         with Image.open(io.BytesIO(data), formats=formats) as image:
             _check_size(path, *image.size)
             image.load()
-            return _to_arrays(ImageOps.exif_transpose(image))
+            ImageOps.exif_transpose(image, in_place=True)  # a copy of 64 megapixels takes 256 MiB
+            return _to_arrays(image)
     except PhotoError:
         raise
     except Image.DecompressionBombError as error:
@@ -137,4 +138,4 @@ def _to_srgb(image: Any, profile: bytes | None) -> Any:
             converted = None
         if converted is not None:
             return converted
-    return image.convert("RGB")
+    return image if image.mode == "RGB" else image.convert("RGB")
