@@ -104,6 +104,9 @@ def test_stopped_at_a_random_moment(name: str, kind: signal.Signals, avatar: Pat
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=lambda: signal.signal(
+                signal.SIGINT, signal.default_int_handler
+            ),  # a background shell ignores it
         )
         time.sleep(rng.uniform(1.0, 8.0))
         if process.poll() is not None:

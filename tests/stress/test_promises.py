@@ -144,7 +144,10 @@ def test_one_array_under_many_names_is_refused(tmp_path: Path) -> None:
         read_arrays(tmp_path / "m.pkl")
 
 
-@pytest.mark.parametrize("change", [{"fl_x": 10**400}, {"file_path": "x" * 5000}, {"file_path": "a\0b"}])
+@pytest.mark.parametrize(
+    "change",
+    [{"fl_x": 10**400}, {"file_path": "x" * 5000}, {"file_path": "a\0b"}, {"file_path": None}],
+)
 def test_camera_and_paths_of_a_capture(change: dict[str, object], tmp_path: Path) -> None:
     (description,) = captures(tmp_path)
     content = json.loads(description.read_text())

@@ -115,6 +115,8 @@ def _frame(folder: Path, entry: Any, number: int) -> Frame:
         if not found:
             raise DataError(f"{folder / value}: is missing, but frame {number} needs it")
         files[name] = value
+    if "file_path" not in files:
+        raise DataError(f"{where}: file_path names no image")
     return parse_frame(entry, files, where, number)
 
 
