@@ -58,6 +58,8 @@ class Viewer:
         self._pose: dict[str, Any] = {}
         self._identity: list[Any] = []
         self._mesh: Any = None
+        self._play: Any = None
+        self._scrub: Any = None
         self._dirty, self._stopped = threading.Event(), threading.Event()
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
         self._frame, self._began = -1, 0.0
@@ -131,7 +133,6 @@ class Viewer:
     def _build_motion(self) -> None:
         gui = self.server.gui
         if self._motion is None:
-            self._play = None
             return
         with gui.add_folder("Motion"):
             self._play = gui.add_checkbox("play", False)
@@ -143,7 +144,7 @@ class Viewer:
     def _build_display(self) -> None:
         gui = self.server.gui
         with gui.add_folder("Display"):
-            colors = gui.add_dropdown("colours", ("photo", "UV"))
+            colors: Any = gui.add_dropdown("colours", ("photo", "UV"))
             colors.on_update(lambda _: self._jobs.put(lambda: self.live.paint(colors.value)))
             mesh = gui.add_checkbox("mesh", False)
             mesh.on_update(lambda _: self._jobs.put(lambda: self._show_mesh(mesh.value)))
@@ -155,7 +156,7 @@ class Viewer:
         button.on_click(lambda event: self._render(event.client))
         with gui.add_folder("Export", expand_by_default=False):
             for kind in _EXPORTS:
-                gui.add_button(kind).on_click(lambda event, kind=kind: self._jobs.put(lambda: self._send(event, kind)))
+                gui.add_button(kind).on_click(self._sender(kind))
 
     def _slider(self, name: str, low: float, high: float, step: float = 0.01) -> Any:
         slider = self.server.gui.add_slider(name.replace("_", " "), low, high, step, 0.0)
@@ -248,6 +249,9 @@ class Viewer:
         self._still.image, self._error.image = picture, difference
         self._still.visible = self._error.visible = True
         self._verdict.content = f"browser against drjit_splat: {decibels:.1f} dB"
+
+    def _sender(self, kind: str) -> Callable[[Any], None]:
+        return lambda event: self._jobs.put(lambda: self._send(event, kind))
 
     def _send(self, event: Any, kind: str) -> None:
         from uika import export
