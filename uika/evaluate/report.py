@@ -20,11 +20,11 @@ _EXPLAINED = (
 )
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; color: #1b1b1f; }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; font-variant-numeric: tabular-nums; }
 .wide { overflow-x: auto; }
-th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid #d8d8de; white-space: nowrap; }
+th, td { padding: .3rem .45rem; text-align: right; border-bottom: 1px solid #d8d8de; vertical-align: bottom; }
 th:first-child, td:first-child { text-align: left; }
-td.absent { color: #8a8a94; font-size: 12px; }
+td.absent { color: #8a8a94; font-size: 11px; }
 details, .note { color: #4c4c55; }
 .strips { display: grid; grid-template-columns: repeat(auto-fill, minmax(520px, 1fr)); gap: 1rem; }
 figure { margin: 0; } figure img { width: 100%; display: block; border: 1px solid #d8d8de; }
