@@ -94,12 +94,12 @@ def require() -> tuple[int, int, int]:
         RuntimeError: no LLVM >= 16 could be loaded; the message says what to install.
     """
     select_library()
-    import drjit as dr
-
     where = os.environ.get(ENV)
     stated = library_version(Path(where)) if where else None
     if stated is not None and stated < MIN_VERSION:  # Dr.Jit would complain in its own words first
         raise RuntimeError(f"{where} is LLVM {stated}, but {MIN_VERSION} or newer is needed; {_install_hint()}")
+    import drjit as dr
+
     if not dr.has_backend(dr.JitBackend.LLVM):
         tried = f"the library {where!r} could not be loaded" if where else "no LLVM library was found"
         raise RuntimeError(
