@@ -76,7 +76,7 @@ def _read_header(path: Path) -> _Header:
         raise ValueError(f"{path} is of none of the formats {', '.join(_KINDS)}")
     elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
-    if first[1:2] != ["vertex"] or not first[-1].isdigit():
+    if first[1:2] != ["vertex"] or not first[-1].isdigit() or len(first[-1]) > 18:
         raise ValueError(f"{path} must start with one 'element vertex <count>'")
     properties = []
     for line in lines[: elements[1] if len(elements) > 1 else None]:

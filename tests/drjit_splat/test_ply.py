@@ -88,6 +88,9 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message):
             load_ply(path)
     # A header that promises more than the file holds must not allocate it.
+    path.write_bytes(whole.replace(b"element vertex 40", b"element vertex " + b"9" * 5000))
+    with pytest.raises(ValueError, match=r"a\.ply must start with"):
+        load_ply(path)
     path.write_bytes(whole.replace(b"element vertex 40", b"element vertex 4000000000000"))
     with pytest.raises(ValueError, match="cut short"):
         load_ply(path)
