@@ -30,7 +30,7 @@ def test_33_rotations_near_zero_have_gradients(worst: Worst, exponent: float, se
     turn = (10**exponent * axis / axis.norm()).requires_grad_()
     wanted = torch.linalg.matrix_exp(_skew(turn.detach().double()))
     found = rodrigues(turn)
-    found.sum().backward()
+    (found * torch.randn(3, 3, generator=torch.Generator().manual_seed(1))).sum().backward()
     assert turn.grad is not None and torch.isfinite(turn.grad).all() and turn.grad.any()
     assert worst("matrix", float((found.detach().double() - wanted).abs().max())) < 2e-6
 
@@ -57,7 +57,7 @@ def test_34_texture_coordinates_out_of_range_count_nothing(seed: int) -> None:
     inside = ((uv >= 0) & (uv < 1)).all(2)
     found = aggregate(images, uv, masks, 8)
     assert float(found.hits.sum()) == int(inside.sum())
-    assert all(torch.isfinite(value).all() for value in vars(found).values())
+    assert all(torch.isfinite(value).all() for value in found)
 
 
 @pytest.mark.parametrize("normalization", ["minmax", "max"])
@@ -123,8 +123,9 @@ def test_39_a_photo_of_nothing_is_read_and_has_no_face(value: int, tmp_path: Pat
         prepare(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "I;16"])
-def test_39_forty_eight_megapixels(worst: Worst, mode: str, tmp_path: Path) -> None:
+def test_39_forty_eight_megapixels(mode: str, tmp_path: Path) -> None:
     path = tmp_path / "large.png"
     if mode == "I;16":
         Image.fromarray(np.full((6000, 8000), 257, np.uint16)).save(path, compress_level=1)
