@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from uika.errors import UikaError
 
+AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say
 
 
@@ -49,6 +52,40 @@ def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8]
                 yield grey, rgb
     except av.FFmpegError as error:
         raise VideoError(f"{path}: cannot be read as a video ({error.strerror})") from error
+
+
+def decode_ahead(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+    """`decode` in a thread of its own, a few frames ahead of whoever reads them."""
+    frames: queue.Queue[tuple[NDArray[np.uint8], NDArray[np.uint8]] | BaseException | None] = queue.Queue(AHEAD)
+    stopped = threading.Event()
+
+    def put(item: tuple[NDArray[np.uint8], NDArray[np.uint8]] | BaseException | None) -> None:
+        while not stopped.is_set():
+            try:
+                return frames.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+
+    def work() -> None:
+        try:
+            for frame in decode(path, colour):
+                put(frame)
+                if stopped.is_set():
+                    return
+            put(None)
+        except BaseException as error:  # raised again where the frames are read
+            put(error)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        while (item := frames.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        stopped.set()
+        thread.join()
 
 
 def frame_rate(path: Path) -> float:

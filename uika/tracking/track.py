@@ -22,7 +22,7 @@ from uika.motion import Motion
 from uika.progress import counted
 from uika.retime import smoothed
 from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_person
-from uika.tracking.decode import VideoError, decode, frame_rate
+from uika.tracking.decode import VideoError, decode_ahead, frame_rate
 from uika.tracking.poses import poses_to_motion, without_gaps
 
 IDENTITY_FRAMES = 8  # the first guess of identity and focal length comes from these
@@ -100,7 +100,7 @@ def track_video(
         person = learn(person, pose, seen.keys[index])
     seconds["identity"] = time.perf_counter() - start
     start = time.perf_counter()
-    frames = counted(decode(Path(path)), progress, len(seen.landmarks), "follow")
+    frames = counted(decode_ahead(Path(path)), progress, len(seen.landmarks), "follow")
     poses = follow_person(person, model, rough, targets, (grey for grey, _ in frames), centre)
     seconds["follow"] = time.perf_counter() - start
     complete = without_gaps(poses, len(seen.landmarks))
@@ -127,7 +127,7 @@ def _look(path: Path, progress: bool) -> _Seen:
     stride, size = 1, (0, 0)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        for grey, rgb in counted(decode(path, colour=True), progress, None, "landmarks"):
+        for grey, rgb in counted(decode_ahead(path, colour=True), progress, None, "landmarks"):
             greys[:] = [grey]
             yield rgb
 
