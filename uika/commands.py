@@ -76,13 +76,13 @@ class Animate:
     video: Path | None = None
     """A video to be driven by, instead of a motion."""
     motion_head: Path | None = None
-    """The FLAME head that FLAME parameters belong to, for an avatar of another head model."""
+    """The FLAME head that FLAME parameters belong to."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
     """The video to write."""
     size: int = 512
     """Side of the picture in pixels, even."""
     fps: float | None = None
-    """Frames per second; 25 or the motion file's own if left out."""
+    """Frames per second; else 25, or the motion's own."""
     watermark: bool = True
     """Mark the frames invisibly as rendered; `uika verify` finds it."""
 
