@@ -24,8 +24,7 @@ from torch import Tensor
 
 from uika.acting import get_motion
 from uika.avatar import Avatar
-from uika.convert.embed import paint, shade
-from uika.head import HeadModel, load_head, look_at, pose_vertices, rodrigues
+from uika.head import HeadModel, load_head, look_at, rodrigues
 from uika.motion import Motion
 from uika.reconstruction import reconstruct
 from uika.rendering import render
@@ -99,15 +98,17 @@ def compare(found: Motion, true: Motion, head: HeadModel) -> dict[str, object]:
     }
 
 
-def sheet(found: Track, video: Path, head: HeadModel) -> Image.Image:
-    """Six frames above, the painted head that follows them below."""
-    colours, tiles = paint(head), []
+def sheet(found: Track, video: Path, avatar: Avatar, head: HeadModel) -> Image.Image:
+    """Six frames above, the avatar that follows them below."""
+    canonical, tiles = avatar.canonical_vertices(head), []
     for index, frame in enumerate(video_frames(video)):
         if index in SHOWN:
             camera = tracked_camera(found, found.poses[index], SIZE // 2)
-            vertices = pose_vertices(head, face_parameters(found, index, head))
+            params = face_parameters(found, index, head).replace(identity=avatar.identity)
+            with torch.no_grad():
+                picture = render(avatar, params, camera, head, canonical=canonical).rgb
             small = np.asarray(Image.fromarray(frame).resize((camera.width, camera.height)))
-            tiles.append(np.concatenate((small, shade(vertices, head.faces, colours, camera)[0])))
+            tiles.append(np.concatenate((small, (picture.clamp(0, 1) * 255).to(torch.uint8).numpy())))
     return Image.fromarray(np.concatenate(tiles, 1))
 
 
@@ -117,12 +118,13 @@ def main() -> None:
     RESULTS.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / "act.mp4"
-        film(reconstruct([PORTRAIT], head, model="none").avatar, motion, head, video)
+        avatar = reconstruct([PORTRAIT], head, model="none").avatar
+        film(avatar, motion, head, video)
         load = os.getloadavg()[0]
         start, processor = time.perf_counter(), time.process_time()
         found = track_video(video, head)
         wall, processor = time.perf_counter() - start, time.process_time() - processor
-        sheet(found, video, head).save(RESULTS / "tracking.png")
+        sheet(found, video, avatar, head).save(RESULTS / "tracking.png")
     figures = compare(found.motion, motion, head)
     speed = {
         "frames": len(motion),
