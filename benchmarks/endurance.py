@@ -54,15 +54,18 @@ def frames(count: int, every: int) -> list[dict[str, float]]:
 
     head = load_head()
     avatar = painted_avatar(head)
-    rows, shown = [], 0
+    rows, shown, compiled = [], 0, 0
     while shown < count:
-        size = (64, 96, 128)[len(rows) % 3]
-        for _ in film(avatar, get_motion("talk", head, 25.0), head=head, size=size):
-            shown += 1
-            if shown % every == 0 or shown == count:
-                rows.append({"step": shown, "MiB": resident(), "compiled": 0})
-            if shown == count:
-                break
+        size, marks = (64, 96, 128)[len(rows) % 3], []
+        with profile() as report:
+            for _ in film(avatar, get_motion("talk", head, 25.0), head=head, size=size):
+                shown += 1
+                if shown % every == 0 or shown == count:
+                    marks.append({"step": shown, "MiB": resident()})
+                if shown == count:
+                    break
+        compiled += report.compiled
+        rows += [mark | {"compiled": compiled} for mark in marks]
     return rows
 
 
