@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from benchmarks.rasterizer_common import interleaved, markdown, save
-from benchmarks.splat_scenes import Scene, named_scene
+from benchmarks.splat_scenes import Scene, named_scene, passes
 from drjit_splat import rasterization
 from drjit_splat.llvm import require
 
@@ -64,17 +64,8 @@ def functions(scene: Scene) -> tuple[dict[str, Callable[[], object]], float]:
 
     parameters = mi.traverse(world)
     keys = [key for key in parameters.keys() if key.split(".")[-1] in ("data", "opacities", "sh_coeffs")]  # noqa: SIM118
-    leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
     weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
     theirs = mi.TensorXf(weight.numpy())
-
-    def forward() -> None:
-        with torch.no_grad():
-            rasterization(*scene.tensors, scene.size, scene.size)
-
-    def both() -> None:
-        image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size)[0][0]
-        torch.autograd.grad(image, leaves, grad_outputs=weight)
 
     def mitsuba_forward() -> Any:
         with dr.suspend_grad():
@@ -93,7 +84,9 @@ def functions(scene: Scene) -> tuple[dict[str, Callable[[], object]], float]:
 
     ours = rasterization(*scene.tensors, scene.size, scene.size)[0][0]
     difference = float((torch.from_numpy(mitsuba_forward().numpy()[..., :3].copy()) - ours).abs().mean())
-    return {"ours": forward, "ours f + b": both, "mitsuba": mitsuba_forward, "mitsuba f + b": mitsuba_both}, difference
+    mine = passes(scene)
+    run = {"ours": mine["forward"], "ours f + b": mine["both"]}
+    return run | {"mitsuba": mitsuba_forward, "mitsuba f + b": mitsuba_both}, difference
 
 
 def main() -> None:

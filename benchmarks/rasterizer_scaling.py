@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -16,7 +16,7 @@ import torch
 
 from benchmarks.rasterizer_common import RESULTS, fastest_fma, interleaved, markdown, save
 from benchmarks.rasterizer_table import BACKWARD_FLOP, FORWARD_FLOP
-from benchmarks.splat_scenes import Scene, head_scene
+from benchmarks.splat_scenes import Scene, head_scene, passes
 from drjit_splat import rasterization
 
 COUNTS = (1_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
@@ -33,25 +33,9 @@ def coloured(scene: Scene, channels: int) -> Scene:
     return replace(scene, colors=torch.rand(len(scene.means), channels, generator=generator))
 
 
-def runs(scene: Scene) -> dict[str, Callable[[], object]]:
-    """Forward and forward + backward."""
-    leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
-    weight = torch.rand(scene.size, scene.size, scene.colors.shape[1], generator=torch.Generator().manual_seed(1))
-
-    def forward() -> None:
-        with torch.no_grad():
-            rasterization(*scene.tensors, scene.size, scene.size)
-
-    def both() -> None:
-        image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size)[0][0]
-        torch.autograd.grad(image, leaves, grad_outputs=weight)
-
-    return {"forward": forward, "both": both}
-
-
 def measure(label: str, value: int, scene: Scene, repeats: int, peak: float) -> dict[str, object]:
     """One row."""
-    functions = runs(scene)
+    functions = passes(scene)
     times = interleaved(functions, dict.fromkeys(functions, repeats))
     with torch.no_grad():
         meta = rasterization(*scene.tensors, scene.size, scene.size)[2]

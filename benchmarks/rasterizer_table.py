@@ -16,7 +16,7 @@ import torch
 
 from benchmarks import torch_baseline
 from benchmarks.rasterizer_common import Timing, fastest_fma, interleaved, markdown, save
-from benchmarks.splat_scenes import NAMES, Scene, named_scene
+from benchmarks.splat_scenes import NAMES, Scene, named_scene, passes
 from drjit_splat import profile, rasterization
 
 # Floating point operations of one 4x4 tile and splat: 16 pixels (recurrence 2, clamps 3, transmittance 3, colours 6;
@@ -31,14 +31,6 @@ def functions(scene: Scene, baseline: bool) -> dict[str, Callable[[], object]]:
     leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
     weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
 
-    def forward() -> None:
-        with torch.no_grad():
-            rasterization(*scene.tensors, scene.size, scene.size)
-
-    def both() -> None:
-        image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size)[0][0]
-        torch.autograd.grad(image, leaves, grad_outputs=weight)
-
     def torch_forward() -> None:
         with torch.no_grad():
             torch_baseline.render(*scene.tensors, scene.size)
@@ -47,8 +39,7 @@ def functions(scene: Scene, baseline: bool) -> dict[str, Callable[[], object]]:
         image = torch_baseline.render(*leaves, *scene.tensors[5:], scene.size)
         torch.autograd.grad(image, leaves, grad_outputs=weight)
 
-    ours: dict[str, Callable[[], object]] = {"forward": forward, "both": both}
-    return ours | ({"torch forward": torch_forward, "torch both": torch_both} if baseline else {})
+    return passes(scene) | ({"torch forward": torch_forward, "torch both": torch_both} if baseline else {})
 
 
 def stages(both: Callable[[], object], repeats: int) -> dict[str, float]:

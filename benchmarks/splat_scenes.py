@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
+
+from drjit_splat import rasterization
 
 PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 NAMES = ("30k", "130k", "500k", "avatar", "heavy")
@@ -123,6 +126,22 @@ def avatar_scene(size: int) -> Scene:
     camera = neutral_camera(avatar, size=size)
     arrays = (means, quats, scales, avatar.opacities, avatar.colors, camera.viewmat[None], camera.K[None])
     return Scene(*(a.to(torch.float32).contiguous() for a in arrays), size=size)
+
+
+def passes(scene: Scene) -> dict[str, Callable[[], object]]:
+    """What the benchmarks time: `forward` without gradients, and `both`, with those of all splats."""
+    leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
+    weight = torch.rand(scene.size, scene.size, scene.colors.shape[1], generator=torch.Generator().manual_seed(1))
+
+    def forward() -> None:
+        with torch.no_grad():
+            rasterization(*scene.tensors, scene.size, scene.size)
+
+    def both() -> None:
+        image = rasterization(*leaves, *scene.tensors[5:], scene.size, scene.size)[0][0]
+        torch.autograd.grad(image, leaves, grad_outputs=weight)
+
+    return {"forward": forward, "both": both}
 
 
 def named_scene(name: str) -> Scene:

@@ -58,7 +58,7 @@ def test_jaw_slider_changes_the_picture(tmp_path):
             share = changed.mean(1)
             assert changed.mean() > 0.01
             assert share[len(share) // 2 :].sum() > 3 * share[: len(share) // 2].sum()  # the jaw, not the skull
-            # three.js reports this of the splat node when its buffer is exchanged; what is drawn is right.
+            # three.js reports bounds that are not a number; where from is not known, and what is drawn is right.
             assert [text for text in tab.problems if "computeBoundingSphere" not in text] == []
 
 
