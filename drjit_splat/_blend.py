@@ -172,6 +172,7 @@ class Blended:
 
     features: Any  # [H * W * F]
     transmittance: Any  # [H * W], what is left behind the splats
+    coverage: Any | None  # [H * W], the sum of the weights, where a depth is divided by it
     end: Any  # [tiles] one past the last list entry that was looked at
     order: Any  # [lanes] lane order by that work, for the backward pass
 
@@ -179,8 +180,8 @@ class Blended:
 def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> Blended:
     """Blend `features` features of each record, front to back."""
     kernel = _recorded(be, features, lists.columns, lists.rows, settings)
-    image, left, end = kernel(records, lists.ids, lists.start, lists.order)
-    return Blended(image, left, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))
+    image, left, covered, end = kernel(records, lists.ids, lists.start, lists.order)
+    return Blended(image, left, covered, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))
 
 
 @lru_cache(maxsize=RECORDINGS)
@@ -191,15 +192,19 @@ def _recorded(be: Backend, features: int, columns: int, rows: int, settings: Set
     comes from these arguments; arrays of other lengths are only read.
     """
 
-    def run(records: Any, ids: Any, start: Any, order: Any) -> tuple[Any, Any, Any]:
+    def run(records: Any, ids: Any, start: Any, order: Any) -> tuple[Any, Any, Any | None, Any]:
         return _blend(be, records, TileLists(ids, start, order, columns, rows), features, settings)
 
     return recorded(run)
 
 
-def _blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> tuple[Any, Any, Any]:
-    """Features [H * W * F], transmittance [H * W] and loop ends [tiles]."""
+def _blend(
+    be: Backend, records: Any, lists: TileLists, features: int, settings: Settings
+) -> tuple[Any, Any, Any | None, Any]:
+    """Features [H * W * F], transmittance [H * W], coverage [H * W] or None, and loop ends [tiles]."""
     J = be.plain
+    # 1 - transmittance has no digits where next to nothing is covered, and an expected depth is divided by it.
+    sums = features + int(settings.expected_depth)
     tile = tile_of(be, lists.order, lists, settings)
     pixels = tile.pixels()
 
@@ -217,6 +222,8 @@ def _blend(be: Backend, records: Any, lists: TileLists, features: int, settings:
                 _, weight, pixel[0] = step(be, clamped_alpha(raw, settings), pixel[0], settings)
                 for f in range(features):
                     pixel[1 + f] = dr.fma(weight, value[f], pixel[1 + f])
+                if settings.expected_depth:
+                    pixel[sums] += weight
         return k + UNROLL, following, state
 
     def go_on(k: Any, splats: list[Any], state: list[list[Any]]) -> Any:
@@ -225,7 +232,7 @@ def _blend(be: Backend, records: Any, lists: TileLists, features: int, settings:
 
     # A pixel's transmittance and sums stay next to each other: the compiled order follows that of the state.
     start = [
-        [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(features))] for _, inside in pixels
+        [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(sums))] for _, inside in pixels
     ]
     # The splats of a turn are read a turn ahead: their records are gathers at addresses that wait for them.
     k, _, state = dr.while_loop(
@@ -236,11 +243,14 @@ def _blend(be: Backend, records: Any, lists: TileLists, features: int, settings:
     )
     size = settings.width * settings.height
     image, left = dr.empty(J.Float, size * features), dr.empty(J.Float, size)
+    covered = dr.empty(J.Float, size) if settings.expected_depth else None
     for p, (index, inside) in enumerate(pixels):
+        if covered is not None:
+            write(covered, state[p][sums], index, inside)
         write(left, dr.abs(state[p][0]), index, inside)
         for f in range(features):
             write(image, state[p][1 + f], index * features + f, inside)
     end = dr.empty(J.UInt32, lists.tiles)
     write(end, smaller(k, tile.last), tile.index, tile.used)
-    dr.eval(image, left, end)
-    return image, left, end
+    dr.eval(image, left, covered, end)
+    return image, left, covered, end

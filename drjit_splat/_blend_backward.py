@@ -58,7 +58,7 @@ def _recorded(
         records: Any, ids: Any, start: Any, image: Any, left: Any, end: Any, order: Any, grad: Any, grad_left: Any
     ) -> Any:
         gradients = dr.zeros(be.plain.Float, capacity * RECORD)
-        lists, blended = TileLists(ids, start, None, columns, rows), Blended(image, left, end, order)
+        lists, blended = TileLists(ids, start, None, columns, rows), Blended(image, left, None, end, order)
         _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings)
         dr.eval(gradients)
         return gradients

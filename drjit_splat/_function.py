@@ -33,7 +33,9 @@ def image_of(trace: _core.Trace, features: int, device: torch.device) -> tuple[T
         return torch.zeros(height, width, features, device=device), torch.zeros(height, width, 1, device=device)
     parts = [chunk.image.features.torch().view(height, width, chunk.count) for chunk in trace.chunks]
     sums = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-    return sums, 1 - trace.chunks[0].image.transmittance.torch().view(height, width, 1)
+    first = trace.chunks[0].image
+    covered = 1 - first.transmittance.torch() if first.coverage is None else first.coverage.torch()
+    return sums, covered.view(height, width, 1)
 
 
 def split(be: Backend, trace: _core.Trace, gradient: Tensor) -> list[Any]:

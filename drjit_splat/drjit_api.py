@@ -55,7 +55,8 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
             for f in range(chunk.count):
                 value = dr.gather(be.plain.Float, chunk.image.features, chunk.count * pixel + f)
                 dr.scatter(sums, value, features * pixel + chunk.first + f, mode=dr.ReduceMode.Permute)
-        coverage = 1 - self.trace.chunks[0].image.transmittance
+        first = self.trace.chunks[0].image
+        coverage = 1 - first.transmittance if first.coverage is None else first.coverage
         return (
             self.kind(_like(self.kind, sums), (height, width, features)),
             self.kind(_like(self.kind, coverage), (height, width, 1)),
