@@ -36,7 +36,9 @@ class Projection:
     covariance: Tensor  # [N, 3] pixels^2: xx, xy, yy with the low-pass
     determinant: Tensor  # [N]
     opacities: Tensor  # [N] after the antialiasing factor
-    visible: Tensor  # [N] bool
+    drawable: Tensor  # [N] bool: between the planes, and its covariance can be inverted
+    visible: Tensor  # [N] bool: and neither too faint, nor too small, nor off screen
+    margin: Tensor  # [N] relative distance of the closest of these decisions to its threshold (not that of `inria`)
     radii: Tensor  # [N, 2] pixels, integer, zero where culled
     span: Tensor  # [N, 2, 2] first pixel and one past the last, in x and in y, that the rules allow
 
@@ -96,6 +98,7 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
     sharp = (torch.linalg.cross(half[:, 0], half[:, 1]) ** 2).sum(-1)
     determinant = sharp + s.eps2d * (xx + yy) + s.eps2d**2
     covariance = torch.stack([xx + s.eps2d, xy, yy + s.eps2d], -1)
+    shape_determinant = determinant
     invertible = (determinant > c.DET_MIN) & (determinant < c.DET_MAX)
     determinant = torch.where(invertible, determinant, torch.ones_like(determinant))
     opacities = splats.opacities
@@ -104,11 +107,11 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
 
     alpha_min = s.options.alpha_min
     bright = opacities.detach() >= alpha_min
-    reach2 = 2 * torch.log(opacities.detach().clamp_min(alpha_min) / alpha_min)
-    extent = (reach2[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
+    log_reach = 2 * torch.log(opacities.detach().clamp_min(alpha_min) / alpha_min)
+    extent = (log_reach[:, None] * covariance.detach()[:, [0, 2]]).sqrt()
     image_size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
     on_screen = ((means2d + extent > 0.5) & (means2d - extent < image_size - 0.5)).all(-1)
-    extent = extent.ceil()
+    reach, extent = extent, extent.ceil()
     span = torch.stack([torch.zeros_like(extent), image_size.expand_as(extent)], -1)
     if s.inria:
         mean = 0.5 * (covariance[:, 0] + covariance[:, 2]).detach()
@@ -122,7 +125,26 @@ def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> P
         on_screen &= (first < end).all(-1)
     visible = in_range & invertible & bright & on_screen & (extent > s.radius_clip).any(-1)
     radii = torch.where(visible[:, None], extent, torch.zeros_like(extent)).to(torch.int32)
-    return Projection(means2d, depths, covariance, determinant, opacities, visible.detach(), radii, span)
+    drawable = (in_range & invertible).detach()
+    margin = _culling_margin(depths, shape_determinant, opacities, means2d, reach, s).detach()
+    return Projection(
+        means2d, depths, covariance, determinant, opacities, drawable, visible.detach(), margin, radii, span
+    )
+
+
+def _culling_margin(
+    depths: Tensor, determinant: Tensor, opacities: Tensor, means2d: Tensor, extent: Tensor, settings: Settings
+) -> Tensor:
+    s = settings
+    near = torch.minimum((depths - s.near).abs() / max(s.near, 1e-12), (depths / s.far_plane - 1).abs())
+    for limit in (c.DET_MIN, c.DET_MAX):
+        near = torch.minimum(near, (determinant / limit - 1).abs())
+    near = torch.minimum(near, (opacities / s.options.alpha_min - 1).abs())
+    if s.radius_clip:
+        near = torch.minimum(near, (extent / s.radius_clip - 1).abs().amin(-1))
+    size = torch.tensor([s.width, s.height], dtype=means2d.dtype, device=means2d.device)
+    room = torch.minimum((means2d + extent - 0.5).abs(), (means2d - extent - size + 0.5).abs())
+    return torch.minimum(near, (room / (1 + means2d.abs() + extent)).amin(-1))
 
 
 def _pixel_centres(settings: Settings, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,6 +154,16 @@ def _pixel_centres(settings: Settings, like: Tensor) -> tuple[Tensor, Tensor]:
         indexing="ij",
     )
     return xs.reshape(1, -1), ys.reshape(1, -1)
+
+
+def raw_alphas(projection: Projection, settings: Settings, order: Tensor) -> Tensor:
+    """opacity * exp(-sigma) [V, H*W] of the splats `order` at all pixels, before any threshold."""
+    p = projection
+    xs, ys = _pixel_centres(settings, p.means2d)
+    dx, dy = xs - p.means2d[order, 0:1], ys - p.means2d[order, 1:2]
+    xx, xy, yy = (p.covariance[order, i : i + 1] for i in range(3))
+    sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / p.determinant[order, None]
+    return p.opacities[order, None] * torch.exp(-sigma)
 
 
 def blend(
@@ -150,10 +182,7 @@ def blend(
         order = torch.argsort(p.depths.detach(), stable=True) if order is None else order
         order = order[p.visible[order]]
     xs, ys = _pixel_centres(settings, p.means2d)
-    dx, dy = xs - p.means2d[order, 0:1], ys - p.means2d[order, 1:2]
-    xx, xy, yy = (p.covariance[order, i : i + 1] for i in range(3))
-    sigma = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / p.determinant[order, None]
-    raw = p.opacities[order, None] * torch.exp(-sigma)
+    raw = raw_alphas(p, settings, order)
 
     alpha_min, alpha_max, t_min = settings.options.alpha_min, settings.alpha_max, settings.options.transmittance_min
     clamped = raw.detach() > alpha_max if decisions is None else decisions.clamped
@@ -219,8 +248,9 @@ def rasterization(
 
     Returns:
         colors [C, H, W, D], alphas [C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii`, `visible` (as in
-        the fast path), `decisions` (one per camera) and `margin` [C, H, W]: how close, relatively, the pixel's closest
-        threshold is; compare images and gradients only where it exceeds the rounding error of the tested code.
+        the fast path), `decisions` (one per camera), `margin` [C, H, W]: how close, relatively, the pixel's closest
+        threshold is, and `culling_margin` [C, N], the same of each splat's visibility; compare only what exceeds the
+        rounding error of the tested code.
 
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
@@ -272,6 +302,7 @@ def rasterization(
         "depths": torch.stack([p.depths for p, _, _ in metas]),
         "radii": torch.stack([p.radii for p, _, _ in metas]),
         "visible": torch.stack([p.visible for p, _, _ in metas]),
+        "culling_margin": torch.stack([p.margin for p, _, _ in metas]),
         "decisions": [taken for _, taken, _ in metas],
         "margin": torch.stack([margin for _, _, margin in metas]),
     }

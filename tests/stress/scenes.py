@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from drjit_splat import reference
 from tests.drjit_splat.common import Comparison, random_scene
 
 # Few sizes: each one compiles its own kernels.
@@ -57,6 +58,32 @@ def ordinary(seed: int) -> Case:
     scene["Ks"][:, :2, :2] *= rng.choice((0.5, 1.0, 2.0))
     if rng.random() < 0.3 or mode in ("D", "ED"):
         del scene["backgrounds"]
+    return Case(scene, width, height, options)
+
+
+def graded(seed: int) -> Case:
+    """Every input takes part: each mode with colours and harmonics, rotations or covariances, backgrounds, 2 cameras.
+
+    A hundred consecutive seeds go through all combinations.
+    """
+    place, mode = divmod(seed, len(MODES))
+    place, kind = divmod(place, 5)
+    place, raster = divmod(place, 2)
+    rng = random.Random(seed)
+    width, height = rng.choice(SIZES)
+    count, cameras = rng.choice((60, 120, 200)), rng.choice((1, 2))
+    scene = random_scene(count, width, height, 3, cameras, seed)
+    options: dict[str, Any] = {"render_mode": MODES[mode], "rasterize_mode": ("classic", "antialiased")[raster]}
+    g = torch.Generator().manual_seed(seed)
+    if kind:
+        options["sh_degree"] = kind - 1
+        scene["colors"] = 0.3 * torch.randn(count, kind * kind, 3, generator=g)
+    scene["viewmats"] = torch.stack([turned(view, rng) for view in scene["viewmats"]])
+    scene["Ks"][:, :2, 2] += 0.3 * (torch.rand(cameras, 2, generator=g) - 0.5) * width
+    if place % 2:
+        root = reference.quats_to_rotations(scene.pop("quats")) * scene.pop("scales")[:, None, :]
+        scene["covars"] = root @ root.mT
+        options |= {"quats": None, "scales": None}
     return Case(scene, width, height, options)
 
 
