@@ -13,7 +13,7 @@ from drjit_splat._inputs import Splats
 from drjit_splat._settings import Settings
 from tests.drjit_splat.common import Comparison, compare
 
-from .scenes import Case, graded, ordinary
+from .scenes import Case, extreme, graded, ordinary
 
 Row = dict[str, Any]
 MARGIN = 1e-4  # relative distance to a threshold within which rounding may decide
@@ -99,3 +99,8 @@ def gradient_errors(seed: int) -> Row:
 
 def extreme_errors(seed: int) -> Row:
     raise NotImplementedError
+
+
+def extreme_errors(seed: int) -> Row:
+    """Errors of an extreme scene."""
+    return _errors(extreme(seed))
