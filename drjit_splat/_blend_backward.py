@@ -18,6 +18,7 @@ from ._blend import (
     read_features,
     step,
     tile_of,
+    uses_recurrence,
 )
 from ._lists import TileLists
 from ._project import RECORD
@@ -127,7 +128,8 @@ def _add_gradients(
                 slopes.append(dr.select(alive & (raw < settings.alpha_max), slope, 0.0))
                 total += weight
             blended_here = total > 0.0
-            add_packet(be, gradients, _moments(J, slopes, geometry[3], s, t), 2 * splat, blended_here)
+            moments = _moments if uses_recurrence(settings) else _moments_pixel_by_pixel
+            add_packet(be, gradients, moments(J, slopes, geometry[3], s, t), 2 * splat, blended_here)
             padding = [J.Float(0)] * (padded - features)
             add_packet(be, gradients, by_value + padding, ratio * splat + ratio // 2, blended_here)
         return k + UNROLL, transmittances, behind
@@ -163,3 +165,18 @@ def _moments(J: Any, slopes: list[Any], h: Any, s: Any, t: Any) -> list[Any]:
         J.Float(0),
         J.Float(0),
     ]
+
+
+def _moments_pixel_by_pixel(J: Any, slopes: list[Any], h: Any, s: Any, t: Any) -> list[Any]:
+    """The same, from every pixel's own distance to the mean.
+
+    Without a low-pass a splat may be a millionth of a pixel wide: squares about the tile's corner would lose it.
+    """
+    sums = [J.Float(0) for _ in range(MOMENTS)]
+    for k, v in enumerate(slopes):
+        row, column = divmod(k, TILE)
+        x, y = dr.fma(h, float(row), s + float(column)), t + float(row)
+        vx, vy = v * x, v * y
+        for i, term in enumerate((v, vx, vy, vx * x, vx * y, vy * y)):
+            sums[i] += term
+    return sums

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +49,7 @@ class Ellipse:
     xy: Any
     yy: Any
     determinant: Any
+    sharpness: Any  # log2(e) yy / (2 determinant), of the variance along x where y is held
     opacity: Any  # after the antialiasing factor
     factor: Any | None
     in_range: Any
@@ -59,12 +62,33 @@ class Ellipse:
         """
         log_opacity = dr.log2(larger(self.opacity, c.OPACITY_FLOOR))
         half = 0.5 * LOG2E
-        return [self.x, self.y, half * self.yy / self.determinant, -self.xy / self.yy, half / self.yy, log_opacity]
+        return [self.x, self.y, self.sharpness, -self.xy / self.yy, half / self.yy, log_opacity]
 
 
-def _spread(shape: Shape, top: list[Any], low: list[Any]) -> tuple[Any, Any, Any, Any]:
-    """Variances xx, xy, yy along the image axes `top` and `low` (rows of the Jacobian), and their determinant."""
-    normal = [top[i] * low[j] - top[j] * low[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+@dataclass(frozen=True)
+class Spread:
+    """A splat's extent along the image axes before the low-pass."""
+
+    xx: Any
+    xy: Any
+    yy: Any
+    sharp: Any  # xx * yy - xy^2
+    a: list[Any]  # the splat's axes along x and y: xx = a.a, xy = a.b, yy = b.b; none of a covariance
+    b: list[Any]
+    minors: list[Any]  # a x b
+
+
+def _dot(u: Sequence[Any], v: Sequence[Any]) -> Any:
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def _cross(u: list[Any], v: list[Any]) -> list[Any]:
+    return [u[i] * v[j] - u[j] * v[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def _spread(shape: Shape, top: list[Any], low: list[Any]) -> Spread:
+    """Variances along the image axes `top` and `low` (rows of the Jacobian)."""
+    normal = _cross(top, low)
     if shape.covariance:
         m = shape.covariance
         xx, xy, _, _, yy, yz, _, _, zz = m
@@ -81,7 +105,8 @@ def _spread(shape: Shape, top: list[Any], low: list[Any]) -> tuple[Any, Any, Any
             return sum(u[r] * (matrix[r][0] * v[0] + matrix[r][1] * v[1] + matrix[r][2] * v[2]) for r in range(3))
 
         sharp = larger(form(normal, adjugate, normal), 0.0)
-        return larger(form(top, rows, top), 0.0), form(top, rows, low), larger(form(low, rows, low), 0.0), sharp
+        xx, yy = larger(form(top, rows, top), 0.0), larger(form(low, rows, low), 0.0)
+        return Spread(xx, form(top, rows, low), yy, sharp, [], [], [])
     squared = sum(q * q for q in shape.quat)
     usable = squared >= c.QUAT_MIN_NORM**2
     inv_norm = 1 / dr.sqrt(dr.select(usable, squared, 1.0))
@@ -92,14 +117,38 @@ def _spread(shape: Shape, top: list[Any], low: list[Any]) -> tuple[Any, Any, Any
         (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)),
         (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)),
     )
-    a = [s * (top[0] * m[0] + top[1] * m[1] + top[2] * m[2]) for s, m in zip(shape.scale, columns, strict=True)]
-    b = [s * (low[0] * m[0] + low[1] * m[1] + low[2] * m[2]) for s, m in zip(shape.scale, columns, strict=True)]
-    xx = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
-    xy = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    yy = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+    a = [s * _dot(top, m) for s, m in zip(shape.scale, columns, strict=True)]
+    b = [s * _dot(low, m) for s, m in zip(shape.scale, columns, strict=True)]
     # A sum of squared minors: the difference xx * yy - xy^2 cancels for needles.
-    minors = [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-    return xx, xy, yy, minors[0] * minors[0] + minors[1] * minors[1] + minors[2] * minors[2]
+    minors = _cross(a, b)
+    return Spread(_dot(a, a), _dot(a, b), _dot(b, b), _dot(minors, minors), a, b, minors)
+
+
+def _sharpness(spread: Spread, yy: Any, determinant: Any, eps2d: Any) -> Any:
+    """log2(e) yy / (2 determinant), with a derivative that keeps its digits for needles and discs of any length.
+
+    determinant / yy is the least value of |a + h b|^2 + eps2d (1 + h^2), so only the residual r = a + h b = (b x (a x b)
+    + eps2d a) / yy takes part in its derivative 2 r.(da + h db). The quotient's own derivative is a difference of terms
+    that grow with the length of the splat and all but cancel.
+    """
+    value = 0.5 * LOG2E * yy / determinant
+    if not spread.a or not dr.is_diff_v(value):
+        return value
+    a, b, minors, plain_yy, slope = (
+        dr.detach(v, True) for v in (spread.a, spread.b, spread.minors, yy, -spread.xy / yy)
+    )
+    turned = _cross(b, minors)
+    residual = [(t + dr.detach(eps2d) * u) / plain_yy for t, u in zip(turned, a, strict=True)]
+    factor = dr.detach(-2.0 * value * yy / determinant)
+    moved = [u + slope * v for u, v in zip(spread.a, spread.b, strict=True)]
+    return dr.replace_grad(value, factor * _dot(residual, moved))
+
+
+def _compensation(spread: Spread, low_pass: Any, determinant: Any) -> Any:
+    """sqrt(sharp / (sharp + low_pass)), written so that large splats, whose factor is 1, get no derivative of noise."""
+    usable = spread.sharp > c.COMPENSATION_MIN * determinant
+    ratio = low_pass / dr.select(usable, spread.sharp, 1.0)
+    return dr.select(usable, 1 / dr.sqrt(1 + ratio), math.sqrt(c.COMPENSATION_MIN))
 
 
 def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: Settings) -> Ellipse:
@@ -124,19 +173,22 @@ def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: 
     cu, cw = clamped(u, fx, cx, cam.width), clamped(w, fy, cy, cam.height)
     top = [fx * inv_z * (v[k] - cu * v[8 + k]) for k in range(3)]
     low = [fy * inv_z * (v[4 + k] - cw * v[8 + k]) for k in range(3)]
-    xx, xy, yy, sharp = _spread(shape, top, low)
-    determinant = sharp + cam.eps2d * (xx + yy) + cam.eps2d * cam.eps2d
+    spread = _spread(shape, top, low)
+    low_pass = cam.eps2d * (spread.xx + spread.yy) + cam.eps2d * cam.eps2d
+    determinant = spread.sharp + low_pass
     invertible = (determinant > c.DET_MIN) & (determinant < c.DET_MAX)
     determinant = dr.select(invertible, determinant, 1.0)
-    factor = dr.sqrt(larger(sharp / determinant, c.COMPENSATION_MIN)) if settings.antialiased else None
+    factor = _compensation(spread, low_pass, determinant) if settings.antialiased else None
+    xx, yy = spread.xx + cam.eps2d, spread.yy + cam.eps2d
     return Ellipse(
         dr.fma(fx, u, cx),
         dr.fma(fy, w, cy),
         pz,
-        xx + cam.eps2d,
-        xy,
-        yy + cam.eps2d,
+        xx,
+        spread.xy,
+        yy,
         determinant,
+        _sharpness(spread, yy, determinant, cam.eps2d),
         opacity if factor is None else opacity * factor,
         factor,
         in_range,

@@ -51,9 +51,11 @@ def test_images_from_gsplats_projection_and_harmonics() -> None:
             torch.stack([d, -b, a], -1) * determinant[:, None],
             determinant,
             scene["opacities"].double(),
-            meta["visible"][i],
-            meta["radii"][i],
-            everywhere,
+            drawable=meta["visible"][i],
+            visible=meta["visible"][i],
+            margin=torch.ones(500, dtype=torch.float64),
+            radii=meta["radii"][i],
+            span=everywhere,
         )
         features = torch.cat([seen.double(), depths[i].double()[:, None]], -1)
         order = torch.argsort(meta["depths"][i], stable=True)

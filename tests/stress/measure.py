@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -11,11 +12,14 @@ from drjit_splat import Options, constants, rasterization, reference
 from drjit_splat._harmonics import colors_seen_from
 from drjit_splat._inputs import Splats
 from drjit_splat._settings import Settings
-from tests.drjit_splat.common import Comparison, compare
+from tests.drjit_splat.common import compare
 
 from .scenes import Case, extreme, graded, ordinary
 
 Row = dict[str, Any]
+LAST_BIT = 2.0**-23
+PERTURBED = 4  # scenes that differ from the given one by rounding
+FLOOR = 1e-6  # relative rounding that is granted without any perturbation
 MARGIN = 1e-4  # relative distance to a threshold within which rounding may decide
 
 
@@ -74,15 +78,15 @@ def skipped_work(case: Case) -> Row:
     return worst
 
 
-def strayed(c: Comparison) -> int:
+def strayed(meta: Mapping[str, Any], expected: dict[str, Any]) -> int:
     """Splats visible on one side only though no threshold is within rounding."""
-    clear = c.expected["culling_margin"] > MARGIN
-    return int(((c.meta["visible"] != c.expected["visible"]) & clear).sum())
+    clear = expected["culling_margin"] > MARGIN
+    return int(((meta["visible"] != expected["visible"]) & clear).sum())
 
 
 def _errors(case: Case) -> Row:
     c = compare(case.scene, case.width, case.height, **case.options)
-    found = {"image": c.image, "alpha": c.alpha, "trusted": c.trusted, "strayed": strayed(c)}
+    found = {"image": c.image, "alpha": c.alpha, "trusted": c.trusted, "strayed": strayed(c.meta, c.expected)}
     return found | {"gradients": c.gradients, "mode": case.options["render_mode"]}
 
 
@@ -97,10 +101,73 @@ def gradient_errors(seed: int) -> Row:
     return _errors(graded(seed))
 
 
-def extreme_errors(seed: int) -> Row:
-    raise NotImplementedError
+def _oracle(
+    case: Case, scene: dict[str, Tensor], weights: tuple[Tensor, Tensor] | None, **options: Any
+) -> tuple[Tensor, Tensor, dict[str, Tensor], dict[str, Any]]:
+    """Image, coverage, gradients of a weighted sum of both, and meta, in float64."""
+    leaves = {k: v.double().requires_grad_() for k, v in scene.items()}
+    image, alpha, meta = reference.rasterization(
+        **leaves, **case.options, **options, width=case.width, height=case.height
+    )
+    found = {}
+    if weights is not None:
+        ((image * weights[0]).sum() + (alpha * weights[1]).sum()).backward()
+        found = {k: v.grad for k, v in leaves.items() if v.grad is not None}
+    return image.detach(), alpha.detach(), found, meta
 
 
 def extreme_errors(seed: int) -> Row:
-    """Errors of an extreme scene."""
-    return _errors(extreme(seed))
+    """Errors of an extreme scene, in units of what the last bit of its inputs changes in the oracle.
+
+    Needles a millionth of a pixel wide have no digits to lose: an input that is off by its own rounding moves them by
+    more than their width. A sound computation in float32 stays within a few times that, whatever the scene.
+    """
+    case = extreme(seed)
+    leaves = {k: v.clone().requires_grad_() for k, v in case.scene.items()}
+    image, alpha, meta = rasterization(**leaves, **case.options, width=case.width, height=case.height)
+    order = torch.argsort(meta["depths"], dim=-1, stable=True)
+    _, _, _, expected = _oracle(case, case.scene, None, order=order)
+    trusted = (expected["margin"] > MARGIN)[..., None]
+    g = torch.Generator().manual_seed(99)
+    weights = (
+        torch.randn(image.shape, generator=g, dtype=torch.float64) * trusted,
+        torch.randn(alpha.shape, generator=g, dtype=torch.float64) * trusted,
+    )
+    ((image * weights[0].float()).sum() + (alpha * weights[1].float()).sum()).backward()
+    held = {"decisions": expected["decisions"]}
+    wanted, wanted_alpha, gradients, _ = _oracle(case, case.scene, weights, **held)
+    moved_image, moved_alpha = torch.zeros_like(wanted), torch.zeros_like(wanted_alpha)
+    moved = {k: torch.zeros((), dtype=torch.float64) for k in gradients}
+    for _ in range(PERTURBED):
+        near = {
+            k: v.double() * (1 + LAST_BIT * (torch.rand(v.shape, generator=g) * 2 - 1)) for k, v in case.scene.items()
+        }
+        near["Ks"][:, 2, 2] = 1
+        other, other_alpha, others, _ = _oracle(case, near, weights, **held)
+        moved_image = torch.maximum(moved_image, (other - wanted).abs() * trusted)
+        moved_alpha = torch.maximum(moved_alpha, (other_alpha - wanted_alpha).abs() * trusted)
+        moved = {k: torch.maximum(m, (others[k] - gradients[k]).norm()) for k, m in moved.items()}
+    error, error_alpha = (image - wanted).detach().abs() * trusted, (alpha - wanted_alpha).detach().abs() * trusted
+    scale = 1 + wanted.abs().max()
+    ratios, errors = {}, {}
+    for name, want in gradients.items():
+        got = leaves[name].grad
+        assert got is not None and torch.isfinite(got).all(), name
+        off = (got - want).norm()
+        errors[name] = float(off / want.norm().clamp_min(1e-12))
+        ratios[name] = float(off / (FLOOR * want.norm() + moved[name]).clamp_min(1e-12))
+    shown, hidden = image.detach()[..., :3], ~meta["visible"].any(0)
+    return {
+        "image": float(error.max()),
+        "alpha": float(error_alpha.max()),
+        "image_ratio": float(error.max() / (FLOOR * scale + moved_image.max())),
+        "alpha_ratio": float(error_alpha.max() / (FLOOR + moved_alpha.max())),
+        "gradients": errors,
+        "gradient_ratios": ratios,
+        "trusted": float(trusted.double().mean()),
+        "visible": int(meta["visible"].sum()),
+        "strayed": strayed(meta, expected),
+        "finite": bool(torch.isfinite(image).all()),
+        "range": [float(shown.min()), float(shown.max())],
+        "hidden_gradient": float(leaves["means"].grad[hidden].abs().sum()),
+    }

@@ -105,10 +105,16 @@ def extreme(seed: int) -> Case:
     scene["means"] = torch.where(torch.rand(count, 1, generator=g) < 0.5, far, scene["means"])
     limits = torch.tensor([0.0, 1e-7, 1 / 255, math.nextafter(1 / 255, 1), 0.999, 1.0])
     chosen = limits[torch.randint(len(limits), (count,), generator=g)]
-    scene["opacities"] = torch.where(torch.rand(count, generator=g) < 0.5, chosen, scene["opacities"])
+    # A splat of 1/255 over the whole image puts every pixel at a threshold, where nothing can be compared.
+    at_limit = (torch.rand(count, generator=g) < 0.5) & (scene["scales"].amax(-1) < 1)
+    scene["opacities"] = torch.where(at_limit, chosen, scene["opacities"])
     scene["viewmats"] = torch.stack([turned(view, rng) for view in scene["viewmats"]])
     scene["Ks"][:, :2, :2] *= rng.choice((0.05, 1.0, 30.0))
-    scene["Ks"][:, :2, 2] += rng.choice((0.0, 5.0 * width, -width))
+    shift = rng.choice((0.0, 5.0 * width, -width))
+    scene["Ks"][:, :2, 2] += shift
+    if rng.random() < 0.8:  # half of what would lie beside the image stays in it
+        aside = torch.rand(count, generator=g) < 0.5
+        scene["means"][aside, :2] -= shift / scene["Ks"][0, 0, 0] * 2
     options = {
         "eps2d": rng.choice((0.0, 1e-6, 0.3)),
         "rasterize_mode": rng.choice(("classic", "antialiased")),
