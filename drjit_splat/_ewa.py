@@ -50,6 +50,7 @@ class Ellipse:
     yy: Any
     determinant: Any
     sharpness: Any  # log2(e) yy / (2 determinant), of the variance along x where y is held
+    lean: Any  # -xy / yy
     opacity: Any  # after the antialiasing factor
     factor: Any | None
     in_range: Any
@@ -62,7 +63,7 @@ class Ellipse:
         """
         log_opacity = dr.log2(larger(self.opacity, c.OPACITY_FLOOR))
         half = 0.5 * LOG2E
-        return [self.x, self.y, self.sharpness, -self.xy / self.yy, half / self.yy, log_opacity]
+        return [self.x, self.y, self.sharpness, self.lean, half / self.yy, log_opacity]
 
 
 @dataclass(frozen=True)
@@ -124,24 +125,25 @@ def _spread(shape: Shape, top: list[Any], low: list[Any]) -> Spread:
     return Spread(_dot(a, a), _dot(a, b), _dot(b, b), _dot(minors, minors), a, b, minors)
 
 
-def _sharpness(spread: Spread, yy: Any, determinant: Any, eps2d: Any) -> Any:
-    """log2(e) yy / (2 determinant), with a derivative that keeps its digits for needles and discs of any length.
+def _sheared(spread: Spread, yy: Any, determinant: Any, eps2d: Any) -> tuple[Any, Any]:
+    """log2(e) yy / (2 determinant) and h = -xy / yy, with derivatives that keep their digits for splats of any length.
 
-    determinant / yy is the least value of |a + h b|^2 + eps2d (1 + h^2), so only the residual r = a + h b = (b x (a x b)
-    + eps2d a) / yy takes part in its derivative 2 r.(da + h db). The quotient's own derivative is a difference of terms
-    that grow with the length of the splat and all but cancel.
+    determinant / yy is the least |a + h b|^2 + eps2d (1 + h^2), so only the residual r = a + h b = (b x (a x b)
+    + eps2d a) / yy takes part in its derivative 2 r.(da + h db), and that of h is -(b.(da + h db) + r.db) / yy. The
+    quotients' own derivatives are differences of terms that grow with the splat and all but cancel, over yy^2, which
+    leaves the range of float32.
     """
-    value = 0.5 * LOG2E * yy / determinant
+    value, h = 0.5 * LOG2E * yy / determinant, -spread.xy / yy
     if not spread.a or not dr.is_diff_v(value):
-        return value
-    a, b, minors, plain_yy, slope = (
-        dr.detach(v, True) for v in (spread.a, spread.b, spread.minors, yy, -spread.xy / yy)
-    )
+        return value, h
+    a, b, minors, plain_yy, slope = (dr.detach(v, True) for v in (spread.a, spread.b, spread.minors, yy, h))
     turned = _cross(b, minors)
     residual = [(t + dr.detach(eps2d) * u) / plain_yy for t, u in zip(turned, a, strict=True)]
     factor = dr.detach(-2.0 * value * yy / determinant)
     moved = [u + slope * v for u, v in zip(spread.a, spread.b, strict=True)]
-    return dr.replace_grad(value, factor * _dot(residual, moved))
+    lean = _dot([v / plain_yy for v in b], moved) + _dot([r / plain_yy for r in residual], spread.b)
+    replace: Any = dr.replace_grad  # its type says that it returns nothing
+    return replace(value, factor * _dot(residual, moved)), replace(h, -lean)
 
 
 def _compensation(spread: Spread, low_pass: Any, determinant: Any) -> Any:
@@ -188,7 +190,7 @@ def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: 
         spread.xy,
         yy,
         determinant,
-        _sharpness(spread, yy, determinant, cam.eps2d),
+        *_sheared(spread, yy, determinant, cam.eps2d),
         opacity if factor is None else opacity * factor,
         factor,
         in_range,

@@ -19,7 +19,8 @@ from .scenes import Case, extreme, graded, ordinary
 Row = dict[str, Any]
 LAST_BIT = 2.0**-23
 PERTURBED = 4  # scenes that differ from the given one by rounding
-FLOOR = 1e-6  # relative rounding that is granted without any perturbation
+FLOOR = 1e-6  # rounding of images that is granted without any perturbation, relative to the brightest
+GRADIENT_FLOOR = 1e-3  # the same of gradients, relative to their norm
 MARGIN = 1e-4  # relative distance to a threshold within which rounding may decide
 
 
@@ -155,7 +156,7 @@ def extreme_errors(seed: int) -> Row:
         assert got is not None and torch.isfinite(got).all(), name
         off = (got - want).norm()
         errors[name] = float(off / want.norm().clamp_min(1e-12))
-        ratios[name] = float(off / (FLOOR * want.norm() + moved[name]).clamp_min(1e-12))
+        ratios[name] = float(off / (GRADIENT_FLOOR * want.norm() + moved[name]).clamp_min(1e-12))
     shown, hidden = image.detach()[..., :3], ~meta["visible"].any(0)
     return {
         "image": float(error.max()),
