@@ -14,7 +14,6 @@ from drjit_splat._inputs import Splats
 from drjit_splat._settings import Settings
 from tests.drjit_splat.common import compare
 
-
 from .scenes import Case, extreme, graded, ordinary
 
 Row = dict[str, Any]

@@ -6,15 +6,8 @@
 
 from __future__ import annotations
 
-import ast
-import json
-import re
-import sys
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
-
-from .campaign import FOLDER, rows
 
 Row = dict[str, Any]
 TESTS = Path(__file__).resolve().parent

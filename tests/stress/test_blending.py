@@ -15,12 +15,12 @@ from .scenes import noted
 
 
 def stacked(opacities: list[float], scale: float = 0.5) -> dict[str, torch.Tensor]:
-    """Splats behind each other on the optical axis."""
+    """Splats behind each other on the optical axis, not round: the rotation of a ball has no gradient to compare."""
     n = len(opacities)
     return one_splat(
         means=[[0.0, 0.0, 2.0 + 0.1 * i] for i in range(n)],
         quats=[[1.0, 0.0, 0.0, 0.0]] * n,
-        scales=[[scale] * 3] * n,
+        scales=[[scale, 0.8 * scale, 0.6 * scale]] * n,
         opacities=opacities,
         colors=[[1.0 - i / n, i / n, 0.5] for i in range(n)],
     )
