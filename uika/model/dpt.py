@@ -61,6 +61,11 @@ def resize_corners(x: Tensor, size: tuple[int, int]) -> Tensor:
     return functional.interpolate(x, size=size, mode="bilinear", align_corners=True)
 
 
+def token_map(tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Tokens [B,h*w,C] of grid (h, w) as a map [B,C,h,w], channels last in memory: convolutions like it best."""
+    return tokens.transpose(1, 2).unflatten(2, grid).contiguous(memory_format=torch.channels_last)
+
+
 def resize_layers(channels: tuple[int, int, int, int]) -> nn.ModuleList:
     """Bring four maps of one grid to four times, twice, once and half its size."""
     return nn.ModuleList(
@@ -99,7 +104,7 @@ class UvDpt(nn.Module):
         """Tokens [B,grid^2,D] shallow to deep, aggregate [B,4,S,S] -> features [B,C,4*grid,4*grid]."""
         levels = []
         for depth, project, scale, merge in zip(tokens, self.projects, self.resize_layers, self.layer_rn, strict=True):
-            level = scale(project(depth.transpose(1, 2).unflatten(2, (self.grid, self.grid))))
+            level = scale(project(token_map(depth, (self.grid, self.grid))))
             levels.append(merge(self._observe(level, aggregate)))
         x: Tensor = levels[3]
         finest = (4 * self.grid, 4 * self.grid)
@@ -112,4 +117,5 @@ class UvDpt(nn.Module):
         if not self.aggregation:
             return level
         size = (level.shape[-2], level.shape[-1])
-        return torch.cat([level, resize(aggregate, size, antialias=True).to(level.dtype)], dim=1)
+        observed = resize(aggregate, size, antialias=True).to(level.dtype)
+        return torch.cat([level, observed.contiguous(memory_format=torch.channels_last)], dim=1)

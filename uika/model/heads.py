@@ -84,23 +84,32 @@ class AttributeHeads(nn.Module):
 
     def forward(self, features: Tensor, observed: Tensor, surface: SurfaceTexels) -> Attributes:
         """features [B,M,W], observed [B,M,4] (aggregate colour and confidence at the texels)."""
-        out = self.out_layers
-        offsets = (torch.sigmoid(out["xyz"](features)) - 0.5) * 2 * self.config.offset_range
-        opacities = torch.sigmoid(out["opacity"](features))[..., 0]
-        scales = out["scaling"](features).clamp_max(_MAX_LOG_SCALE).exp()
-        quats = functional.normalize(out["rotation"](features), dim=-1)
+        out = self._linear(features)
+        offsets = (torch.sigmoid(out["xyz"]) - 0.5) * 2 * self.config.offset_range
+        opacities = torch.sigmoid(out["opacity"])[..., 0]
+        scales = out["scaling"].clamp_max(_MAX_LOG_SCALE).exp()
+        quats = functional.normalize(out["rotation"], dim=-1)
         if self.config.relative:
             scales = scales * surface.scales
             quats = multiply_quaternions(surface.quats.expand_as(quats), quats)
-        colors, weight = self._color(features, observed)
+        colors, weight = self._color(out["shs"], observed)
         return Attributes(offsets, quats, scales.clamp(0, self.config.scale_clip), opacities, colors, weight)
 
-    def _color(self, features: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
+    def _linear(self, features: Tensor) -> dict[str, Tensor]:
+        """All layers as one product, which reads the features once; `shs` still lacks the share of the observation."""
+        layers = {name: cast(nn.Linear, layer) for name, layer in self.out_layers.items()}
+        width = features.shape[-1]
+        weight = torch.cat([layer.weight[:, :width] for layer in layers.values()])
+        values = functional.linear(features, weight, torch.cat([layer.bias for layer in layers.values()]))
+        parts = values.split([layer.out_features for layer in layers.values()], dim=-1)
+        return dict(zip(layers, parts, strict=True))
+
+    def _color(self, values: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
         """Self-adaptive fusion (paper eq. 9): predicted colour with share w, observed colour with share 1-w."""
-        layer = self.out_layers["shs"]
         if not self.aggregation:
-            predicted = torch.sigmoid(layer(features))
+            predicted = torch.sigmoid(values)
             return predicted, torch.ones_like(predicted[..., 0])
-        values = torch.sigmoid(layer(torch.cat([features, observed], dim=-1)))
+        layer = cast(nn.Linear, self.out_layers["shs"])
+        values = torch.sigmoid(values + functional.linear(observed, layer.weight[:, -observed.shape[-1] :]))
         weight = values[..., 3:] if self.fusion == "learned" else 0.5 * observed[..., 3:]
         return weight * values[..., :3] + (1 - weight) * observed[..., :3], weight[..., 0]

@@ -18,7 +18,7 @@ from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
-_TEXELS = 8192  # at once without gradients: few enough to stay in the processor's cache, changes no value
+_TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
 
 
 class GaussianDecoder(nn.Module):
@@ -35,15 +35,14 @@ class GaussianDecoder(nn.Module):
     def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
         """Tokens of four depths, observed [B,4,S,S], texel [M]."""
         features = resize(self.dpt_decoder(tokens, observed), (self.map_size, self.map_size))
-        step = len(texel) if torch.is_grad_enabled() else _TEXELS
+        features, seen = _gather(features, texel), _gather(observed, texel)
         # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
         with torch.autocast(features.device.type, enabled=False):
             parts = []
-            for first in range(0, max(len(texel), 1), step or 1):
-                rows = texel[first : first + step]
-                seen = _gather(observed, rows)
-                part = surface.rows(first, first + len(rows))
-                parts.append(self.gs_net(self.mlp_net(_gather(features, rows).to(seen.dtype)), seen, part))
+            for first in range(0, max(len(texel), 1), _TEXELS):
+                rows = slice(first, first + _TEXELS)
+                inner = self.mlp_net(features[:, rows].to(seen.dtype))
+                parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS)))
         return Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
 
 
@@ -118,16 +117,15 @@ class Reconstructor(nn.Module):
         photos, mattes, coords = (value.flatten(0, 1)[:, None] for value in (images, masks, pixel_uv))
         trust = None if weights is None else weights.flatten(0, 1)[:, None]
 
-        def screen(chosen: list[int]) -> list[Tensor]:
+        def screen(chosen: list[int] | slice) -> list[Tensor]:
             return self._screen(photos[chosen], mattes[chosen], keep)
 
-        def atlas(chosen: list[int]) -> list[tuple[Tensor | None, Sums]]:
+        def atlas(chosen: list[int] | slice) -> list[tuple[Tensor | None, Sums]]:
             rows = (photos[chosen], mattes[chosen], coords[chosen], None if trust is None else trust[chosen])
             return self._atlas(*rows, keep)
 
         if cache is None:
-            everything = list(range(images.shape[0] * images.shape[1]))
-            tokens, maps = screen(everything), atlas(everything)
+            tokens, maps = screen(slice(None)), atlas(slice(None))
         else:
             seen = (photos, None if keep == "all" else mattes)
             tokens = cache.resolve("screen", content_keys(seen, keep), screen)
@@ -250,7 +248,8 @@ class Reconstructor(nn.Module):
         patch = self.config.backbone.patch_size
         if not self.config.image_size and (images.shape[3] % patch or images.shape[4] % patch):
             raise ValueError(f"images must have sides that are multiples of {patch}, got {list(images.shape)}")
-        if not bool(torch.isfinite(images).all()):
+        # One bad value spoils the sum, which is quicker to find.
+        if not bool(torch.isfinite(images.sum())) and not bool(torch.isfinite(images).all()):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
@@ -265,4 +264,5 @@ class Reconstructor(nn.Module):
 
 def _gather(maps: Tensor, texel: Tensor) -> Tensor:
     """[B,C,S,S] at row-major texels [M] -> [B,M,C]."""
-    return maps.flatten(2).index_select(2, texel).transpose(1, 2)
+    # Whole rows of channels are picked, which lie together in maps that are channels last.
+    return maps.permute(0, 2, 3, 1).flatten(1, 2).index_select(1, texel)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from uika.model.config import EstimatorConfig
-from uika.model.dpt import RefineBlock, resize_corners, resize_layers
+from uika.model.dpt import RefineBlock, resize_corners, resize_layers, token_map
 
 _POSITION_BASE = 100.0
 _POSITION_SHARE = 0.1
@@ -69,7 +69,7 @@ class UvHead(nn.Module):
         aspect = grid[1] / grid[0]
         levels = []
         for level, project, scale, name in zip(tokens, self.projects, self.resize_layers, "1234", strict=True):
-            x = project(self.norm(level).transpose(1, 2).unflatten(2, grid))
+            x = project(token_map(self.norm(level), grid))
             levels.append(self._part(f"layer{name}_rn")(scale(_placed(x, aspect))))
         x = levels[3]
         for name in "4321":

@@ -103,64 +103,85 @@ def accumulate_sizes(
     for view in range(batch * views):
         item, index = divmod(view, views)
         trust = None if weights is None else weights[item, index]
-        table, valid = _table(images[item, index], uv[item, index], masks[item, index], grid, trust)
-        for sample in _samples(table, valid, oversample):
-            payload = torch.cat([sample[2:], torch.ones_like(sample[:1])]).double() / oversample**2
+        table = _table(images[item, index], uv[item, index], masks[item, index], grid, trust)
+        scratch = torch.empty(table[2:].numel(), dtype=torch.float64, device=table.device)
+        for sample in _samples(table, oversample):
+            payload = scratch[: sample[2:].numel()].view(5, -1).copy_(sample[2:].flatten(1))
             for size, total in zip(sizes, totals, strict=True):
                 total[view].scatter_add_(1, _cells(sample[:2], size, grid).expand(5, -1), payload)
-    maps = [total.view(batch, views, 5, size, size) for size, total in zip(sizes, totals, strict=True)]
+    maps = [
+        total.div_(oversample**2).view(batch, views, 5, size, size) for size, total in zip(sizes, totals, strict=True)
+    ]
     return [Sums(color=parts[:, :, :3], weight=parts[:, :, 3:4], samples=parts[:, :, 4:5]) for parts in maps]
 
 
-def _table(image: Tensor, uv: Tensor, mask: Tensor, grid: Grid, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Rows (u, v, weighted r, g, b, weight) [6,H,W] of one view, and which pixels count [H,W]."""
+def _table(image: Tensor, uv: Tensor, mask: Tensor, grid: Grid, weight: Tensor | None) -> Tensor:
+    """Rows (u, v, weighted r, g, b, weight, 1) [7,h,w] of one view, cropped to the pixels that count.
+
+    Pixels inside the crop that do not count carry 0 in the last five rows.
+    """
     share = mask.float() if grid == "centers" else (mask > 0).float()
     if weight is not None:
         share = share * weight
     coords = uv.float() if grid == "centers" else uv.float().clamp(0, 1)
+    valid = (share[0] > 0) & ((coords >= 0) & (coords <= 1)).all(dim=0)
+    rows, columns = (_extent(valid.any(dim=axis)) for axis in (1, 0))
+    share, coords = share[:, rows, columns], coords[:, rows, columns]
     # Colours are premultiplied so that samples between two pixels follow the trusted one.
-    table = torch.cat([coords, image.float() * share, share])
-    valid = torch.isfinite(table).all(dim=0) & (share[0] > 0) & ((coords >= 0) & (coords <= 1)).all(dim=0)
-    return table, valid
+    table = torch.cat([coords, image[:, rows, columns].float() * share, share, torch.ones_like(share)])
+    valid = valid[rows, columns] & torch.isfinite(table[2:6]).all(dim=0)
+    # Each goes to another texel: sums of zeros into a single one would wait for each other.
+    away = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, n) for n in valid.shape), indexing="ij"))
+    table[:2] = torch.where(valid, table[:2], away.to(table.device).flip(0))
+    table[2:].masked_fill_(~valid, 0.0)
+    return table
+
+
+def _extent(used: Tensor) -> slice:
+    """From the first to the last True of [L]."""
+    places = used.nonzero()
+    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0)
 
 
 def _cells(uv: Tensor, size: int, grid: Grid) -> Tensor:
-    """Row-major texel of uv [2,P]."""
-    if grid == "centers":
-        column_row = (uv * size).floor().long().clamp_(0, size - 1)
-    else:
-        column_row = torch.round(uv * (size - 1)).long()
-    return column_row[1] * size + column_row[0]
+    """Row-major texels [h*w] of uv [2,h,w]."""
+    # The conversion cuts off the fraction, which rounds down as nothing is negative.
+    place = (uv * size).clamp_max_(size - 1) if grid == "centers" else torch.round(uv * (size - 1))
+    column, row = place.long()
+    return (row * size + column).flatten()
 
 
-def _samples(table: Tensor, valid: Tensor, oversample: int) -> Iterator[Tensor]:
-    """Yield interpolated columns [6,P] for each of the k*k positions inside the pixels' cells."""
-    height, width = valid.shape
-    flat, usable = table.flatten(1), valid.flatten()
-    pixel = usable.nonzero()[:, 0]
-    here = flat.index_select(1, pixel)
-    yield here
-    if oversample == 1:
+def _samples(table: Tensor, oversample: int) -> Iterator[Tensor]:
+    """Yield interpolated rows [7,h,w] for each of the k*k positions inside the pixels' cells."""
+    yield table
+    if oversample == 1 or 0 in table.shape:
         return
-    column, row = pixel % width, torch.div(pixel, width, rounding_mode="floor")
-    inside = {1: column < width - 1, width: row < height - 1}
-    inside[width + 1] = inside[1] & inside[width]
-    linked = {}
-    for step, exists in inside.items():
-        other = torch.where(exists, pixel + step, pixel)
-        there = flat.index_select(1, other)
-        close = (there[:2] - here[:2]).abs().amax(dim=0) <= MAX_UV_STEP
-        linked[step] = exists & usable.index_select(0, other) & close
-    right, down = (linked[step].nonzero()[:, 0] for step in (1, width))
-    cell = (linked[1] & linked[width] & linked[width + 1]).nonzero()[:, 0]
+    right, down, across = table[:, :, 1:], table[:, 1:], table[:, 1:, 1:]
+    beside, below = _linked(table, right), _linked(table, down)
+    inside = beside[:-1] & below[:, :-1] & _linked(table, across)
     fractions = [step / oversample for step in range(1, oversample)]
-    for chosen, step in ((right, 1), (down, width)):
-        start, end = here.index_select(1, chosen), flat.index_select(1, pixel[chosen] + step)
-        yield from (torch.lerp(start, end, fraction) for fraction in fractions)
-    corners = [flat.index_select(1, pixel[cell] + step) for step in (0, 1, width, width + 1)]
+    for fraction in fractions:
+        yield _between(table, right, fraction, beside)
+        yield _between(table, down, fraction, below)
     for x in fractions:
-        top, bottom = torch.lerp(corners[0], corners[1], x), torch.lerp(corners[2], corners[3], x)
-        yield from (torch.lerp(top, bottom, y) for y in fractions)
+        edges = _between(table, right, x)
+        for y in fractions:
+            yield _between(edges, edges[:, 1:], y, inside)
+
+
+def _linked(table: Tensor, other: Tensor) -> Tensor:
+    """Whether pixels of a table and those of its shifted copy both count and lie close in UV."""
+    here = table[:, : other.shape[1], : other.shape[2]]
+    close = ((other[:2] - here[:2]).abs_() <= MAX_UV_STEP).all(dim=0)
+    return close & (here[6] > 0) & (other[6] > 0)
+
+
+def _between(table: Tensor, other: Tensor, fraction: float, linked: Tensor | None = None) -> Tensor:
+    """On the way from a table to its shifted copy; pixels that are not linked carry nothing."""
+    sample = torch.lerp(table[:, : other.shape[1], : other.shape[2]], other, fraction)
+    if linked is not None:
+        sample[2:] *= linked
+    return sample
 
 
 def _check(
