@@ -180,7 +180,7 @@ def stir(model: Reconstructor, seed: int = 0) -> None:
         for parameter in model.parameters():
             if parameter.ndim > 1:
                 spread = 0.3 / math.sqrt(parameter[0].numel())
-                parameter += spread * torch.randn(parameter.shape, generator=generator)
+                parameter.add_(spread * torch.randn(parameter.shape, generator=generator))
 
 
 def table(rows: Sequence[Figures]) -> str:
