@@ -27,6 +27,7 @@ class LossWeights:
     offset: float = 0.1
     entropy: float = 0.0
     alpha: float = 0.1
+    atlas: float = 0.0  # of colours against the true ones of the atlas, where data with exact correspondence has them
     variation: float = 0.001  # of the estimator's maps
 
 
@@ -46,6 +47,8 @@ class TrainConfig:
     images: int = 4  # photos per process and step, shared by its heads
     items: int = 2  # most heads per process and step
     size: int = 256  # pixels of photos and pictures
+    texels: int = 0  # side of the atlas in training, which may be coarser than in use; 0 for the preset's
+    atlas_views: int = 0  # more pictures per head that only tell the atlas's true colours
     fitted: float = 0.5  # share of heads whose correspondence comes from a landmark fit
     augment: bool = True
     # Optimiser
@@ -72,6 +75,8 @@ class TrainConfig:
         for name in ("steps", "sources", "targets", "images", "items", "save_every", "keep", "patience"):
             if getattr(self, name) < 1:
                 raise UikaError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.texels < 0 or self.atlas_views < 0:
+            raise UikaError("texels and atlas_views must not be negative")
         if self.size < 32 or self.size % 16:
             raise UikaError(f"size must be a multiple of 16 and at least 32 pixels, not {self.size}")
         for name in ("fitted", "ema"):
@@ -82,12 +87,17 @@ class TrainConfig:
 
     @property
     def model(self) -> ModelConfig:
-        """Architecture of the reconstructor, with the fusion weight's start for training."""
-        config = PRESETS[self.preset] if self.architecture is None else self.architecture
+        """Architecture of the reconstructor in training: the fusion weight's start, the side of the atlas."""
+        config = dataclasses.replace(self.finished, map_size=self.texels or self.finished.map_size)
         start = config.gaussians
         if start.fusion_bias is None or start.fusion_bias >= self.fusion_bias:
             return config
         return dataclasses.replace(config, gaussians=dataclasses.replace(start, fusion_bias=self.fusion_bias))
+
+    @property
+    def finished(self) -> ModelConfig:
+        """Architecture of the reconstructor in use; no weight depends on the side of the atlas."""
+        return PRESETS[self.preset] if self.architecture is None else self.architecture
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary for JSON."""
@@ -97,7 +107,16 @@ class TrainConfig:
 _LARGE = {"sources": 16, "targets": 8, "images": 16, "items": 8, "size": 512, "warmup": 3000, "checkpointing": True}
 
 TRAINING: dict[str, TrainConfig] = {
-    "tiny": TrainConfig(),
+    "tiny": TrainConfig(
+        steps=4000,
+        targets=2,
+        images=2,
+        texels=256,
+        atlas_views=4,
+        learning_rate=1e-3,
+        warmup=100,
+        losses=LossWeights(alpha=0.3, atlas=1.0),
+    ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
     # The paper's recipe: no running mean, losses as printed.
     "paper": TrainConfig(preset="paper", steps=150_000, ema=0.0, losses=LossWeights(alpha=0.0), **_LARGE),  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from torch.nn import functional
 from uika.data import Sample
 from uika.head import Camera
 
-_SOLID = 0.98  # mask from which a pixel shows the person alone
+SOLID = 0.98  # mask from which a pixel shows the person alone
 _REACH = 3  # pixels that colours are continued beyond it
 _ZOOM, _SHIFT = (0.85, 1.2), 0.05  # of a jittered crop, relative to the picture
 
@@ -85,7 +85,7 @@ def _squared(sample: Sample) -> dict[str, Any]:
 
 def _foreground(image: Tensor, mask: Tensor) -> Tensor:
     """The person's own colours [3,H,W]: pixels mixed with the backdrop take those of their neighbours inside."""
-    share = (mask >= _SOLID).float()[None]
+    share = (mask >= SOLID).float()[None]
     colour = image * share
     for _ in range(_REACH):
         spread = functional.avg_pool2d(torch.cat((colour * share, share))[None], 3, 1, 1)[0]

@@ -42,7 +42,7 @@ def export(path: Path, task: Task, mean: RunningMean, config: TrainConfig, progr
         "step": str(progress.step),
     }
     if isinstance(task.model, Reconstructor):
-        copy = Reconstructor(task.model.config)
+        copy = Reconstructor(dataclasses.replace(task.model.config, map_size=config.finished.map_size))
         copy.load_state_dict(state)
         save_checkpoint(path, copy, torch.bfloat16, provenance)
     elif isinstance(task.model, Estimator):

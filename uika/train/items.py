@@ -18,6 +18,7 @@ from uika.train.config import TrainConfig
 from uika.train.crops import View
 from uika.train.people import People, Person
 from uika.train.sampler import Draw
+from uika.train.texture import true_texture
 
 _MIN_FACING = 0.25  # cosine between face and camera of a photo that somebody would use
 _TRIES = 3  # people tried in the place of one that cannot be read
@@ -49,6 +50,7 @@ class Item:
     pictures: Tensor  # [D,3,S,S] on the colours of `backgrounds`
     coverage: Tensor  # [D,1,S,S]
     backgrounds: Tensor  # [D,3]
+    texture: Tensor  # [4,A,A] true colours of the atlas and where they are known; empty if nowhere
 
     def to(self, device: torch.device) -> Item:
         """A copy on another device."""
@@ -81,7 +83,8 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
     def _make(self, person: Person, draw: Draw, note: str) -> Item:
         random = np.random.default_rng(draw.seed)
         config, head = self._config, load_head()
-        wanted = config.targets if config.part == "reconstructor" else 0
+        extra = config.atlas_views if config.losses.atlas else 0
+        wanted = config.targets + extra if config.part == "reconstructor" else 0
         photos, pictures = _choose(person, draw.sources, wanted, config.size, random)
         for view in (*photos, *pictures):
             _check(view, head, config)
@@ -90,6 +93,11 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             shared = draw_grade(random)
             for view in (*photos, *pictures):
                 view.image = shared(view.image)
+        texture = torch.zeros(0)
+        if config.losses.atlas and config.part == "reconstructor":
+            texture = true_texture((*photos, *pictures), config.model.map_size)
+            pictures = pictures[: config.targets]
+        if config.augment:
             for view in photos:
                 view.jitter(random)
                 view.image = degrade(draw_grade(random, _GRADE_BETWEEN)(view.image), random)
@@ -101,7 +109,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         keys = tuple(view.key for view in (*photos, *pictures))
         none = torch.zeros(0)
         if config.part == "estimator":
-            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 11)
+            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 12)
         fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
         uv, valid, weight = pixel_uv(fit, head, masks)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -132,6 +140,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             pictures=torch.stack([view.over(back) for view, back in zip(pictures, backgrounds, strict=True)]),
             coverage=torch.stack([view.mask for view in pictures])[:, None],
             backgrounds=backgrounds.contiguous(),
+            texture=texture,
         )
 
 

@@ -82,7 +82,7 @@ class ReconstructionTask:
     def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
         """Weighted losses, and `psnr` in dB for the log."""
         image, alpha = self.render(output, item)
-        _, _, _, opacities, _, offsets = output
+        _, _, _, opacities, colors, offsets = output
         weights = self._losses
         terms = {
             "l1": weights.l1 * l1(image, item.pictures),
@@ -97,8 +97,16 @@ class ReconstructionTask:
             terms["entropy"] = weights.entropy * opacity_entropy(opacities)
         if weights.alpha:
             terms["alpha"] = weights.alpha * alpha_loss(alpha, item.coverage)
+        if weights.atlas and len(item.texture):
+            terms["atlas"] = weights.atlas * self._atlas(colors, item.texture)
         square = (image.detach() - item.pictures).square().mean(dim=(1, 2, 3))
         return terms | {"psnr": (-10 * torch.log10(square.clamp_min(1e-10))).mean()}
+
+    def _atlas(self, colors: Tensor, texture: Tensor) -> Tensor:
+        """Mean distance of colours [M,3] from the true ones where those are known."""
+        truth = texture.flatten(1)[:, self._binding.texel.to(texture.device)].mT
+        known = truth[:, 3:]
+        return ((colors - truth[:, :3]).abs() * known).sum() / (3 * known.sum()).clamp_min(1)
 
     def render(self, output: Sequence[Tensor], item: Item) -> tuple[Tensor, Tensor]:
         """Pictures [D,3,S,S] and coverage [D,1,S,S] of Gaussians in an item's poses; equal poses share one call."""
