@@ -60,6 +60,16 @@ class Reconstruction:
     report: Report
 
 
+class FittedPhotos(NamedTuple):
+    """N photos of one person and the heads and cameras fitted to them."""
+
+    photos: tuple[Photo, ...]
+    fit: Fit
+    images: Tensor  # [N,3,S,S] on one plain colour
+    mattes: Tensor  # [N,S,S] in [0,1]
+    digests: list[str]  # of the files
+
+
 def reconstruct(
     photos: Sequence[str | Path],
     head: HeadModel | None = None,
@@ -87,13 +97,27 @@ def reconstruct(
     """
     if not 1 <= len(photos) <= MAX_PHOTOS:
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
-    from uika.correspondence import fit_photos
-    from uika.photo import head_matte, prepare
-
     report = Report() if report is None else report
     with report.stage("model"):
         loaded = load_model(model)
         head = load_head() if head is None else head
+    observed = fit_files(photos, head, refine=refine, report=report)
+    avatar = avatar_from_fit(loaded, head, observed.fit, observed.images, observed.mattes, observed.digests, report)
+    return Reconstruction(avatar, observed.photos, observed.fit, report)
+
+
+def fit_files(
+    photos: Sequence[str | Path], head: HeadModel, *, refine: bool = False, report: Report | None = None
+) -> FittedPhotos:
+    """Read photos of one person and fit the head to them; they come out in the order of their content hashes.
+
+    Raises:
+        PhotoError: a photo cannot be read or shows no face; the message names it.
+    """
+    from uika.correspondence import fit_photos
+    from uika.photo import head_matte, prepare
+
+    report = Report() if report is None else report
     with report.stage("photos"):
         prepared = sorted((prepare(path) for path in photos), key=lambda photo: photo.sha256)
         hair = [head_matte(photo) for photo in prepared]
@@ -102,9 +126,7 @@ def reconstruct(
         fit = fit_photos(prepared, head, hair, images=pictures)
     images = torch.stack([photo.image for photo in prepared])
     mattes = torch.stack([photo.matte for photo in prepared])
-    digests = [photo.sha256 for photo in prepared]
-    avatar = avatar_from_fit(loaded, head, fit, images, mattes, digests, report)
-    return Reconstruction(avatar, tuple(prepared), fit, report)
+    return FittedPhotos(tuple(prepared), fit, images, mattes, [photo.sha256 for photo in prepared])
 
 
 @torch.no_grad()

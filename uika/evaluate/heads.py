@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
 from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
-from uika.reconstruction import LoadedModel, Report, avatar_from_fit, reconstruct
+from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files
 from uika.rendering import render
 from uika.train.crops import View
 from uika.train.items import aligned_camera
@@ -26,10 +27,23 @@ from uika.video import to_bytes
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any
 
 
-def make_avatar(
-    sources: Sequence[Sample], loaded: LoadedModel, model: str, correspondence: str, head: HeadModel
-) -> Avatar:
-    """Reconstruct from source frames, by landmark fits of the pictures ("fit") or their true heads ("exact").
+class Observed(NamedTuple):
+    """What is known of N source frames, in the order that `avatar_from_fit` takes it."""
+
+    fit: Fit
+    images: Tensor  # [N,3,S,S] on white
+    mattes: Tensor  # [N,S,S]
+    digests: list[str]
+
+
+def observe_sources(sources: Sequence[Sample], correspondence: str, size: int, head: HeadModel) -> Observed:
+    """Heads and cameras of source frames: by landmark fits of the pictures ("fit") or their true ones ("exact").
+
+    Args:
+        sources: N frames of one person.
+        correspondence: "fit" or "exact".
+        size: pixels of a side of the photos; fits decide by themselves.
+        head: the head model.
 
     Raises:
         PhotoError: a source shows no face that can be found.
@@ -40,15 +54,20 @@ def make_avatar(
             paths = [Path(folder) / f"{sample.key}.png" for sample in sources]
             for path, sample in zip(paths, sources, strict=True):
                 _write_cutout(path, sample)
-            return reconstruct(paths, head, model).avatar
+            return Observed(*fit_files(paths, head)[1:])
     for sample in sources:
         check_sample(sample, head)
-    views = [View(sample, loaded.network.config.image_size or _PHOTO_SIDE) for sample in sources]
+    views = [View(sample, size) for sample in sources]
     parameters = HeadParameters.stack([_parameters(view) for view in views])
     fit = Fit(parameters, Camera.stack([v.camera for v in views]), _offset(views[0], head), torch.zeros(len(views)))
     images = torch.stack([view.over(torch.ones(3)) for view in views])
-    mattes = torch.stack([view.mask for view in views])
-    return avatar_from_fit(loaded, head, fit, images, mattes, [view.key for view in views], Report())
+    return Observed(fit, images, torch.stack([view.mask for view in views]), [view.key for view in views])
+
+
+def make_avatar(sources: Sequence[Sample], loaded: LoadedModel, correspondence: str, head: HeadModel) -> Avatar:
+    """Reconstruct from source frames; raises as `observe_sources` does."""
+    size = loaded.network.config.image_size or _PHOTO_SIDE
+    return avatar_from_fit(loaded, head, *observe_sources(sources, correspondence, size, head), Report())
 
 
 def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: float) -> list[Tensor]:

@@ -155,8 +155,7 @@ class _Run:
             images = [external_picture(*place, name, protocol.size) for name in driver.target_names]
         else:
             start = time.perf_counter()
-            how = self._settings.model, self._settings.correspondence
-            avatar = make_avatar(sources, self._loaded, *how, judges.head)
+            avatar = make_avatar(sources, self._loaded, self._settings.correspondence, judges.head)
             seconds = time.perf_counter() - start
             images = drive(avatar, truth.views, judges.head, protocol.background)
         results = Pictures.of(images)

@@ -50,8 +50,9 @@ class GaussianConfig:
     offset_range   metres, offsets lie in +-offset_range
     scale_clip     metres, upper end of every scale
     init_scale     log of the initial scale in metres (absolute) or of its ratio to the texel size (relative)
-    fusion_bias    initial logit of the fusion weight, with zero weights in the colour layer; None leaves that layer at
-                   the default random initialisation
+    fusion_bias    initial logit of the fusion weight where nothing was seen; predicted colours then start as the
+                   completed observation. None leaves the colour layer at the default random initialisation
+    fusion_trust   how much that logit falls, at the start, as confidence goes from 0 to 1
     """
 
     relative: bool
@@ -60,6 +61,7 @@ class GaussianConfig:
     init_scale: float = -5.0
     init_opacity: float = 0.1
     fusion_bias: float | None = None
+    fusion_trust: float = 0.0
 
 
 @dataclass(frozen=True)

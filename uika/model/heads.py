@@ -14,6 +14,7 @@ from uika.model.gaussians import SurfaceTexels, multiply_quaternions
 
 # Keeps exp and its gradient finite whatever the network says; far above any scale that survives the clip.
 _MAX_LOG_SCALE = 15.0
+_COLOR_GAIN = 4.0  # sigmoid(4 * (c - 1/2)) is close to c
 
 
 class Attributes(NamedTuple):
@@ -45,8 +46,8 @@ class TexelMlp(nn.Module):
 class AttributeHeads(nn.Module):
     """Linear layers `out_layers.{xyz,opacity,scaling,rotation,shs}`, all starting from the values in the config.
 
-    Their weights start at zero, so every texel of the untrained model has the same attributes: offset exactly 0,
-    rotation the identity, scale exp(init_scale), opacity init_opacity.
+    Their weights start at zero, so every texel of the untrained model has the same shape: offset exactly 0, rotation
+    the identity, scale exp(init_scale), opacity init_opacity. Only the colour layer reads the observation from the start.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -75,12 +76,16 @@ class AttributeHeads(nn.Module):
             "rotation": [1.0, 0.0, 0.0, 0.0],
         }
         if start.fusion_bias is not None:
-            biases["shs"] = [0.0] * 3 + ([start.fusion_bias] if self._learned else [])
+            middle = -_COLOR_GAIN / 2 if self.aggregation else 0.0
+            biases["shs"] = [middle] * 3 + ([start.fusion_bias] if self._learned else [])
         with torch.no_grad():
             for name, bias in biases.items():
                 layer = cast(nn.Linear, self.out_layers[name])
                 nn.init.zeros_(layer.weight)
                 layer.bias.copy_(torch.tensor(bias))
+                if name == "shs" and self.aggregation:
+                    layer.weight[:3, -4:-1] = _COLOR_GAIN * torch.eye(3)
+                    layer.weight[3:, -1] = -start.fusion_trust
 
     def forward(self, features: Tensor, observed: Tensor, surface: SurfaceTexels) -> Attributes:
         """features [B,M,W], observed [B,M,4] (aggregate colour and confidence at the texels)."""

@@ -38,7 +38,10 @@ class TrainConfig:
     preset: str = "tiny"
     architecture: ModelConfig | None = None  # of the reconstructor in the place of the preset's, for ablations
     part: Part = "reconstructor"
-    fusion_bias: float = -3.0  # first logit of the fusion weight; untrained presets keep it so low that nothing learns
+    # First logit of the fusion weight where nothing was seen, and its fall with confidence: untrained presets keep the
+    # weight so low that predicted colours would not learn.
+    fusion_bias: float = 1.0
+    fusion_trust: float = 12.0
     steps: int = 20000
     seed: int = 0
     # Data
@@ -92,7 +95,8 @@ class TrainConfig:
         start = config.gaussians
         if start.fusion_bias is None or start.fusion_bias >= self.fusion_bias:
             return config
-        return dataclasses.replace(config, gaussians=dataclasses.replace(start, fusion_bias=self.fusion_bias))
+        start = dataclasses.replace(start, fusion_bias=self.fusion_bias, fusion_trust=self.fusion_trust)
+        return dataclasses.replace(config, gaussians=start)
 
     @property
     def finished(self) -> ModelConfig:
@@ -113,8 +117,9 @@ TRAINING: dict[str, TrainConfig] = {
         images=2,
         texels=256,
         atlas_views=4,
-        learning_rate=1e-3,
-        warmup=100,
+        learning_rate=2e-3,
+        warmup=50,
+        precision="float32",
         losses=LossWeights(alpha=0.3, atlas=1.0),
     ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
