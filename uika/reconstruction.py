@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from uika.photo import Photo
 
 MAX_PHOTOS = 64
+BUILT_IN = Path(__file__).parent / "assets" / "tiny.safetensors"
 _UNTRAINED_OPACITY = 0.95
 
 
@@ -85,8 +86,8 @@ def reconstruct(
     Args:
         photos: 1 to 64 photo files, each showing the face.
         head: the head model; None loads the one that `uika.head.load_head` finds.
-        model: "tiny", the built-in network, which without training keeps the photos' colours on the fitted surface;
-            "none", the same without running a network; or the path of a trained model (.safetensors).
+        model: "tiny", the built-in network; "none", which keeps the photos' colours on the fitted surface and runs no
+            network; or the path of a trained model (.safetensors).
         refine: whether to refine the fit with the colours that two or more photos share.
         report: filled while the stages pass; None makes a new one.
 
@@ -200,7 +201,7 @@ def load_model(model: str | Path) -> LoadedModel:
 
     check_model(model)
     if str(model) == "tiny":
-        return LoadedModel(build("tiny").eval(), "tiny (untrained)", True)
+        return LoadedModel(load_checkpoint(BUILT_IN), "tiny", True)
     if str(model) == "none":
         return LoadedModel(build("tiny").eval(), "none", False)
     network = load_checkpoint(model)

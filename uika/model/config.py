@@ -176,7 +176,7 @@ PRESETS: dict[str, ModelConfig] = {
         name="tiny",
         image_size=256,
         map_size=384,
-        token_grid=24,
+        token_grid=16,
         backbone=BackboneConfig(dim=128, depth=4, heads=4, taps=(0, 1, 2, 3), layer_scale=0.1),
         dim=128,
         heads=4,

@@ -113,9 +113,11 @@ _LARGE = {"sources": 16, "targets": 8, "images": 16, "items": 8, "size": 512, "w
 TRAINING: dict[str, TrainConfig] = {
     "tiny": TrainConfig(
         steps=4000,
-        targets=2,
-        images=2,
-        texels=256,
+        targets=1,
+        images=3,
+        items=3,
+        fitted=0.35,
+        texels=192,
         atlas_views=4,
         learning_rate=2e-3,
         warmup=50,
