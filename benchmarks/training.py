@@ -33,6 +33,11 @@ def command(data: Path, folder: Path, steps: int, images: int) -> list[str]:
     return [*words, "--size", str(SIZE), "--images", str(images), "--save-every", str(SAVE_EVERY), "--resume"]
 
 
+def steps_done(log: Path) -> int:
+    """Lines of a log that may be written to at the same moment."""
+    return log.read_bytes().count(b"\n") if log.exists() else 0
+
+
 def start(words: Sequence[str]) -> subprocess.Popen[bytes]:
     """A training in a process group of its own."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -45,9 +50,9 @@ def watched(words: Sequence[str], log: Path) -> list[tuple[int, float]]:
     while process.poll() is None:
         time.sleep(1)
         status = Path(f"/proc/{process.pid}/statm")
-        if status.exists() and log.exists():
+        if status.exists():
             pages = int(status.read_text().split()[1])
-            seen.append((len(read_log(log.parent)), pages * os.sysconf("SC_PAGESIZE") / 2**20))
+            seen.append((steps_done(log), pages * os.sysconf("SC_PAGESIZE") / 2**20))
     if process.returncode:
         raise SystemExit(f"training failed with {process.returncode}: {' '.join(words)}")
     return seen
@@ -57,15 +62,15 @@ def interrupted(words: Sequence[str], log: Path, steps: int, kills: int) -> list
     """Run to the end with `kills` SIGKILLs on the way; the steps at which they came."""
     chance, struck = random.Random(0), []
     for _ in range(kills):
-        done = len(read_log(log.parent)) if log.exists() else 0
+        done = steps_done(log)
         goal = chance.randint(done + 5, done + (steps - done) // 2)
         process = start(words)
-        while process.poll() is None and (not log.exists() or len(read_log(log.parent)) < goal):
+        while process.poll() is None and steps_done(log) < goal:
             time.sleep(0.2)
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            struck.append(len(read_log(log.parent)))
+            struck.append(steps_done(log))
     watched(words, log)
     return struck
 
@@ -149,8 +154,8 @@ def main() -> None:
     text = (
         f"Killed at steps {', '.join(map(str, kills))} and continued: the losses of all {options.steps} steps equal "
         f"those of the run left alone to a relative {apart:.1e}.\n\n"
-        f"Memory of the trainer after a tenth of {options.long} steps {tenth[0]:.0f} MiB, at most {max(tenth):.0f} MiB, "
-        f"at the end {tenth[-1]:.0f} MiB.\n\n"
+        f"Memory of the trainer after a tenth of {options.long} steps {tenth[0]:.0f} MiB, at most {max(tenth):.0f} MiB"
+        f", at the end {tenth[-1]:.0f} MiB.\n\n"
         f"Two gloo processes beside one with the same heads a step:\n\n{markdown(equal)}\n\n"
         f"Seconds of a step by stage, {SIZE} x {SIZE} pixels, medians:\n\n{markdown(split(logs[0]))}"
     )

@@ -7,7 +7,8 @@ import torch
 
 from benchmarks.head_quality import PORTRAIT, mesh_figures, photograph, photos_figures, portrait_figures
 from uika.avatar import Avatar
-from uika.head import HeadModel, HeadParameters, load_head, look_at
+from uika.head import HeadModel, HeadParameters, load_head, look_at, uv_texels
+from uika.model import build, save_checkpoint
 from uika.reconstruction import Reconstruction, reconstruct
 from uika.rendering import render
 
@@ -48,11 +49,26 @@ def test_splats_agree_with_mitsuba(portrait: Reconstruction, head: HeadModel) ->
         assert figures.depth_median_mm <= 3.0
 
 
-def test_network_at_its_start_keeps_the_surface(portrait: Reconstruction, head: HeadModel) -> None:
+def test_network_at_its_start_keeps_the_surface(head: HeadModel, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "start.safetensors", build("tiny"))
+    start = reconstruct([PORTRAIT], head, model=tmp_path / "start.safetensors").avatar
     plain = reconstruct([PORTRAIT], head, model="none").avatar
-    tiny = portrait.avatar
-    assert torch.equal(plain.means, tiny.means)
-    assert (plain.colors - tiny.colors).abs().max() < 2e-3
+    assert torch.equal(plain.means, start.means)
+    assert (plain.colors - start.colors).abs().max() < 2e-3
+
+
+def test_trained_network_keeps_what_was_seen_and_paints_the_rest(portrait: Reconstruction, head: HeadModel) -> None:
+    plain, trained = reconstruct([PORTRAIT], head, model="none").avatar, portrait.avatar
+    change = (plain.colors - trained.colors).abs().mean(-1)
+    binding = uv_texels(head, 384)
+
+    def on(name: str) -> torch.Tensor:
+        corners = head.masks[name][head.faces[binding.triangle]]
+        return (corners * binding.barycentric).sum(-1) > 0.9
+
+    behind = on("scalp") & (trained.means[:, 2] < trained.means[:, 2].mean())
+    assert change[on("face")].median() < 0.04
+    assert change[behind].median() > change[on("face")].median()
 
 
 def test_avatar_survives_its_file(portrait: Reconstruction, tmp_path: Path) -> None:
