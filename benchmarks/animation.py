@@ -83,7 +83,7 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
             found.setdefault("pose", []).append(1e3 * (time.perf_counter() - start))
             with profile() as report:
                 start = time.perf_counter()
-                stage.shoot(mesh, turn, view)
+                stage.develop(stage.expose(mesh, turn, view))
                 dr.sync_thread()
                 found.setdefault("frame", []).append(1e3 * (time.perf_counter() - start))
             for name, spent in report.stages.items():

@@ -23,7 +23,7 @@ from ._backend import (
     smaller,
     write,
 )
-from ._lists import TileLists, lane_order
+from ._lists import TileLists
 from ._project import RECORD
 from ._settings import Settings
 
@@ -174,14 +174,12 @@ class Blended:
     transmittance: Any  # [H * W], what is left behind the splats
     coverage: Any | None  # [H * W], the sum of the weights, where a depth is divided by it
     end: Any  # [tiles] one past the last list entry that was looked at
-    order: Any  # [lanes] lane order by that work, for the backward pass
 
 
 def blend(be: Backend, records: Any, lists: TileLists, features: int, settings: Settings) -> Blended:
     """Blend `features` features of each record, front to back."""
     kernel = _recorded(be, features, lists.columns, lists.rows, settings)
-    image, left, covered, end = kernel(records, lists.ids, lists.start, lists.order)
-    return Blended(image, left, covered, end, lane_order(be, lists.lengths(be, end), lists.columns, lists.rows))
+    return Blended(*kernel(records, lists.ids, lists.start, lists.order))
 
 
 @lru_cache(maxsize=RECORDINGS)
@@ -198,15 +196,16 @@ def _recorded(be: Backend, features: int, columns: int, rows: int, settings: Set
     return recorded(run)
 
 
-def _blend(
+def accumulate(
     be: Backend, records: Any, lists: TileLists, features: int, settings: Settings
-) -> tuple[Any, Any, Any | None, Any]:
-    """Features [H * W * F], transmittance [H * W], coverage [H * W] or None, and loop ends [tiles]."""
+) -> tuple[Tile, list[list[Any]], Any]:
+    """The lanes' tiles; of each of their 16 pixels the transmittance (negated where it has stopped), the sums of the
+    features and, where a depth is divided by it, the coverage; and one past the last list entry that was looked at.
+    """
     J = be.plain
     # 1 - transmittance has no digits where next to nothing is covered, and an expected depth is divided by it.
     sums = features + int(settings.expected_depth)
     tile = tile_of(be, lists.order, lists, settings)
-    pixels = tile.pixels()
 
     def body(k: Any, splats: list[Any], state: list[list[Any]]) -> tuple[Any, list[Any], list[list[Any]]]:
         state = [list(pixel) for pixel in state]
@@ -232,7 +231,8 @@ def _blend(
 
     # A pixel's transmittance and sums stay next to each other: the compiled order follows that of the state.
     start = [
-        [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(sums))] for _, inside in pixels
+        [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(sums))]
+        for _, inside in tile.pixels()
     ]
     # The splats of a turn are read a turn ahead: their records are gathers at addresses that wait for them.
     k, _, state = dr.while_loop(
@@ -241,16 +241,25 @@ def _blend(
         body,
         mode="symbolic",
     )
+    return tile, state, smaller(k, tile.last)
+
+
+def _blend(
+    be: Backend, records: Any, lists: TileLists, features: int, settings: Settings
+) -> tuple[Any, Any, Any | None, Any]:
+    """Features [H * W * F], transmittance [H * W], coverage [H * W] or None, and loop ends [tiles]."""
+    J = be.plain
+    tile, state, last = accumulate(be, records, lists, features, settings)
     size = settings.width * settings.height
     image, left = dr.empty(J.Float, size * features), dr.empty(J.Float, size)
     covered = dr.empty(J.Float, size) if settings.expected_depth else None
-    for p, (index, inside) in enumerate(pixels):
+    for (index, inside), pixel in zip(tile.pixels(), state, strict=True):
         if covered is not None:
-            write(covered, state[p][sums], index, inside)
-        write(left, dr.abs(state[p][0]), index, inside)
+            write(covered, pixel[1 + features], index, inside)
+        write(left, dr.abs(pixel[0]), index, inside)
         for f in range(features):
-            write(image, state[p][1 + f], index * features + f, inside)
+            write(image, pixel[1 + f], index * features + f, inside)
     end = dr.empty(J.UInt32, lists.tiles)
-    write(end, smaller(k, tile.last), tile.index, tile.used)
+    write(end, last, tile.index, tile.used)
     dr.eval(image, left, covered, end)
     return image, left, covered, end

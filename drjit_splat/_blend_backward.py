@@ -20,7 +20,7 @@ from ._blend import (
     tile_of,
     uses_recurrence,
 )
-from ._lists import TileLists
+from ._lists import TileLists, lane_order
 from ._project import RECORD
 from ._settings import Settings
 
@@ -43,8 +43,9 @@ def blend_backward(
     those of its features share a cache line.
     """
     key = (be, capacity, features, lists.columns, lists.rows, settings, dr.thread_count())
-    arrays = (records, lists.ids, lists.start, blended.features, blended.transmittance, blended.end, blended.order)
-    return _recorded(*key)(*arrays, grad_features, grad_coverage)
+    order = lane_order(be, lists.lengths(be, blended.end), lists.columns, lists.rows)
+    image = (blended.features, blended.transmittance, blended.end)
+    return _recorded(*key)(records, lists.ids, lists.start, order, *image, grad_features, grad_coverage)
 
 
 @lru_cache(maxsize=RECORDINGS)
@@ -56,10 +57,10 @@ def _recorded(
     """
 
     def run(
-        records: Any, ids: Any, start: Any, image: Any, left: Any, end: Any, order: Any, grad: Any, grad_left: Any
+        records: Any, ids: Any, start: Any, order: Any, image: Any, left: Any, end: Any, grad: Any, grad_left: Any
     ) -> Any:
         gradients = dr.zeros(be.plain.Float, capacity * RECORD)
-        lists, blended = TileLists(ids, start, None, columns, rows), Blended(image, left, None, end, order)
+        lists, blended = TileLists(ids, start, order, columns, rows), Blended(image, left, None, end)
         _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings)
         dr.eval(gradients)
         return gradients
@@ -85,7 +86,7 @@ def _add_gradients(
     alpha dL/dalpha = w (c . g) - behind * alpha / (1 - alpha).
     """
     J = be.plain
-    tile = tile_of(be, blended.order, lists, settings)
+    tile = tile_of(be, lists.order, lists, settings)
     stop = dr.gather(J.UInt32, blended.end, tile.index, tile.used)
     padded = power_of_two(features)
 

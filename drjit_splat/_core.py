@@ -54,12 +54,17 @@ class Trace:
         return found
 
 
+def queue(be: Backend, arrays: Arrays, settings: Settings, features: int) -> _project.Queued:
+    """Begin to project N >= 1 splats."""
+    camera = _project.read_camera(be, arrays, settings)
+    return _project.run(be, arrays, features, min(features, CHUNK), camera, settings)
+
+
 def geometry(be: Backend, arrays: Arrays, settings: Settings, features: int) -> Trace:
     """Project N >= 1 splats and list them tile by tile; check `projected.nonfinite` before going on."""
     trace = Trace(be, settings)
     with stage("project"):
-        camera = _project.read_camera(be, arrays, settings)
-        trace.projected = _project.run(be, arrays, features, min(features, CHUNK), camera, settings)
+        trace.projected = queue(be, arrays, settings, features).result()
     if trace.projected.pairs and not trace.projected.nonfinite:
         trace.lists = _lists.build(be, trace.projected, settings)
     return trace

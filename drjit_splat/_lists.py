@@ -162,6 +162,15 @@ def lane_order(be: Backend, lengths: Any, columns: int, rows: int) -> Any:
     return dr.gather(J.UInt32, tile, dr.detail.block_mkperm(keys, area, LENGTH_BUCKETS))
 
 
+def empty(be: Backend, settings: Settings) -> TileLists:
+    """Lists of tiles that no splat touches."""
+    J = be.plain
+    columns, rows = -(-settings.width // TILE), -(-settings.height // TILE)
+    ids, start, lengths = (dr.zeros(J.UInt32, size) for size in (1, columns * rows + 2, columns * rows))
+    dr.make_opaque(ids, start, lengths)
+    return TileLists(ids, start, lane_order(be, lengths, columns, rows), columns, rows)
+
+
 def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
     """Lists for a projection with at least one pair."""
     J = be.plain

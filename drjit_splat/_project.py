@@ -61,8 +61,8 @@ def read_splats(be: Backend, arrays: Arrays, i: Any) -> tuple[list[Any], Shape, 
 
 
 @dataclass(frozen=True)
-class Projected:
-    """Results of the projection kernel for N splats."""
+class Queued:
+    """Results of a projection kernel that may still run; see `Projected`."""
 
     records: Any  # [N * RECORD]
     footprints: Any  # [N * 8]
@@ -73,6 +73,20 @@ class Projected:
     counts: Any  # [N] tiles
     visible: Any  # [N] Bool
     radii: Any  # [N * 2] Int32
+    tally: Any  # [PAIRS + 1] splats by reason of culling, then what the names of its places say
+
+    def result(self) -> Projected:
+        """The same once the kernel has ended; waits for it."""
+        totals = [int(total) for total in self.tally.numpy()]
+        culled = {name: totals[code] for code, name in enumerate(CULLED) if code}
+        return Projected(**vars(self), pairs=totals[PAIRS], box_pairs=totals[BOX_PAIRS], culled=culled,
+            nonfinite=totals[NONFINITE] > 0)
+
+
+@dataclass(frozen=True)
+class Projected(Queued):
+    """Results of the projection kernel for N splats."""
+
     pairs: int
     box_pairs: int  # pairs of the bounding boxes, where they are counted
     culled: dict[str, int]
@@ -88,7 +102,7 @@ def _finite(be: Backend, values: list[Any]) -> Any:
     return finite
 
 
-def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Camera, settings: Settings) -> Projected:
+def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Camera, settings: Settings) -> Queued:
     """Project N >= 1 splats.
 
     The record takes the first `first_features` features; when depth is one of them it is the last of all.
@@ -150,20 +164,4 @@ def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Ca
         dr.scatter_add(tally, box, J.UInt32(BOX_PAIRS), mode=be.scatter_mode)
     opacities = e.opacity if settings.antialiased else arrays.opacities
     dr.eval(records, footprints, bounds, e.z, counts, visible, radii, tally, opacities, e.factor)
-    totals = [int(total) for total in tally.numpy()]
-    culled = {name: totals[code] for code, name in enumerate(CULLED) if code}
-    return Projected(
-        records,
-        footprints,
-        bounds,
-        e.z,
-        opacities,
-        e.factor,
-        counts,
-        visible,
-        radii,
-        totals[PAIRS],
-        totals[BOX_PAIRS],
-        culled,
-        totals[NONFINITE] > 0,
-    )
+    return Queued(records, footprints, bounds, e.z, opacities, e.factor, counts, visible, radii, tally)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from uika.head.binding import rigid_turn
 from uika.head.posing import rest_joints
 from uika.motion import Motion
 from uika.rendering import counted, motion_cameras
+
+if TYPE_CHECKING:
+    from drjit_splat.pictures import Exposure, Picture
 
 _BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
 
@@ -44,8 +47,8 @@ class Stage:
             avatar.barycentric,
         )
         self._head = _personal(head, avatar.identity, self.canonical)
-        self._opacities, self._colors = _tensor(avatar.opacities), _tensor(avatar.colors)
-        self._background = _tensor(torch.tensor([list(background)]))
+        self._opacities, self._colors = _flat(avatar.opacities), _flat(avatar.colors)
+        self._background = _flat(torch.tensor(list(background)))
 
     def meshes(self, params: HeadParameters) -> tuple[Tensor, Tensor]:
         """Vertices [T,V,3] in metres and rigid turns [T,4] of T frames; the identity in `params` is ignored."""
@@ -54,42 +57,23 @@ class Stage:
             vertices = pose_vertices(self._head, own)
             return vertices, rigid_turn(self.canonical, vertices)
 
-    def shoot(self, vertices: Tensor, turn: Tensor, camera: Camera) -> Any:
-        """Queue the work for one frame's bytes [H * W * 3], a Dr.Jit array; the image is not waited for.
+    def expose(self, vertices: Tensor, turn: Tensor, camera: Camera) -> Exposure:
+        """Begin with one frame: queue its Gaussians and their projection; nothing is waited for.
 
         Args:
             vertices: [V,3] one of `meshes`.
             turn: [4] its rigid turn.
             camera: one camera.
         """
-        import drjit as dr
-        from drjit.llvm import UInt8
-        from drjit.llvm.ad import Float, TensorXf
+        from drjit_splat.pictures import expose
 
-        from drjit_splat.drjit_api import rasterization
+        posed = self.rig.pose(vertices, turn)
+        view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
+        return expose(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
 
-        count = self.rig.count
-        means, quats, scales = (
-            TensorXf(Float(array), (count, size))
-            for array, size in zip(self.rig.pose(vertices, turn), (3, 4, 3), strict=True)
-        )
-        picture, _ = rasterization(
-            means,
-            quats,
-            scales,
-            self._opacities,
-            self._colors,
-            _tensor(camera.viewmat[None]),
-            _tensor(camera.K[None]),
-            camera.width,
-            camera.height,
-            backgrounds=self._background,
-        )
-        values: Any = dr.detach(picture.array)
-        values = dr.select(values > 0, dr.select(values < 1, values, 1), 0)
-        image = UInt8(dr.round(255 * values))
-        dr.eval(image)
-        return image
+    def develop(self, exposure: Exposure) -> Picture:
+        """Wait for an exposure's projection and queue the rest."""
+        return exposure.develop(self._background)
 
 
 def film(
@@ -104,7 +88,8 @@ def film(
 ) -> Iterator[NDArray[np.uint8]]:
     """Render a motion frame by frame as bytes; what `frames` renders, without alpha and gradients.
 
-    Each frame is blended while the one before it is in the caller's hands.
+    Each frame is posed and projected while the one before it is blended, and blended while that one is in the caller's
+    hands.
 
     Args:
         avatar: the avatar.
@@ -126,22 +111,18 @@ def film(
     stage = Stage(avatar, model, background)
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
-    waiting: Any = None
+    picture: Picture | None = None
     for index in counted(len(motion), progress):
         place = index % _BLOCK
         if place == 0:
             vertices, turns = stage.meshes(params[index : index + _BLOCK])
-        queued = stage.shoot(vertices[place], turns[place], path[index])
-        if waiting is not None:
-            yield _picture(waiting, path)
-        waiting = queued
-    yield _picture(waiting, path)
-
-
-def _picture(image: Any, camera: Camera) -> NDArray[np.uint8]:
-    # The array may be a view of memory that Dr.Jit uses again.
-    pixels: NDArray[np.uint8] = np.array(image.numpy(), copy=True)
-    return pixels.reshape(camera.height, camera.width, 3)
+        exposure = stage.expose(vertices[place], turns[place], path[index])
+        done = None if picture is None else picture.numpy()
+        picture = stage.develop(exposure)
+        if done is not None:
+            yield done
+    if picture is not None:
+        yield picture.numpy()
 
 
 def _personal(head: HeadModel, identity: Tensor, canonical: Tensor) -> HeadModel:
@@ -156,7 +137,7 @@ def _personal(head: HeadModel, identity: Tensor, canonical: Tensor) -> HeadModel
     )
 
 
-def _tensor(values: Tensor) -> Any:
-    from drjit.llvm.ad import Float, TensorXf
+def _flat(values: Tensor) -> Any:
+    from drjit.llvm import Float
 
-    return TensorXf(Float(values.float().flatten().numpy()), tuple(values.shape))
+    return Float(values.float().contiguous().flatten().numpy())

@@ -1,0 +1,128 @@
+"""Pictures for the eye: eight bits a channel, without gradients, and in two steps so that frames overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _core, _lists
+from ._backend import RECORDINGS, TILE, Backend, backend_named, exclusive, larger, recorded, smaller, write
+from ._blend import accumulate
+from ._lists import TileLists
+from ._project import Arrays, Queued
+from ._settings import Settings
+from .profiling import stage
+
+CHANNELS = 3
+WORDS = TILE * CHANNELS // 4  # 32-bit words that hold the bytes of a tile's row
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that may still be in the making."""
+
+    words: Any  # whole tiles, row by row, each pixel's three bytes after those of its left neighbour
+    width: int
+    height: int
+
+    def numpy(self) -> NDArray[np.uint8]:
+        """The bytes [H, W, 3]; waits for them."""
+        rows, columns = -(-self.height // TILE), -(-self.width // TILE)
+        # The array may be a view of memory that Dr.Jit uses again.
+        pixels = np.array(self.words.numpy(), copy=True).view(np.uint8)
+        return pixels.reshape(rows * TILE, columns * TILE, CHANNELS)[: self.height, : self.width]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Splats on their way to the image plane; made by `expose`."""
+
+    settings: Settings
+    queued: Queued
+
+    @exclusive
+    def develop(self, background: Any) -> Picture:
+        """Wait for the projection and begin to blend.
+
+        Args:
+            background: [3] in [0, 1], a flat Dr.Jit array.
+
+        Raises:
+            ValueError: a value of a splat or the camera is not finite.
+            MemoryError: the splats cover more tiles than can be stored.
+        """
+        be = backend_named(True)
+        projected = self.queued.result()
+        if projected.nonfinite:
+            raise ValueError("every value of the splats and the camera must be finite in float32")
+        lists = _lists.build(be, projected, self.settings) if projected.pairs else _lists.empty(be, self.settings)
+        kernel = _recorded(be, lists.columns, lists.rows, self.settings)
+        with stage("blend"):
+            words = kernel(projected.records, lists.ids, lists.start, lists.order, background)
+        return Picture(words, self.settings.width, self.settings.height)
+
+
+@exclusive
+def expose(
+    means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, view: Any, intrinsics: Any, width: int, height: int
+) -> Exposure:
+    """Begin to project N >= 1 splats, for a picture as `rasterization` makes it, rounded to bytes.
+
+    What follows needs the number of tiles that the splats cover. Whatever else is queued before `develop` asks for it,
+    such as the picture before this one, is done meanwhile.
+
+    Args:
+        means: [N * 3], like all arrays flat and of the type `drjit.llvm.Float`.
+        quats: [N * 4] wxyz.
+        scales: [N * 3].
+        opacities: [N].
+        colors: [N * 3].
+        view: [16] world to camera.
+        intrinsics: [9].
+        width: pixels.
+        height: pixels.
+
+    Raises:
+        RuntimeError: no LLVM library was found; the message says what to install.
+    """
+    be = backend_named(True)
+    settings = Settings(width, height)
+    settings.check()
+    count = dr.width(opacities)
+    arrays = Arrays(count, CHANNELS, means, quats, scales, None, opacities, colors, view, intrinsics)
+    return Exposure(settings, _core.queue(be, arrays, settings, CHANNELS))
+
+
+@lru_cache(maxsize=RECORDINGS)
+def _recorded(be: Backend, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
+    """The kernel of one image size, traced at its first call; see `_blend._recorded`."""
+
+    def run(records: Any, ids: Any, start: Any, order: Any, background: Any) -> Any:
+        return _print(be, records, TileLists(ids, start, order, columns, rows), background, settings)
+
+    return recorded(run)
+
+
+def _print(be: Backend, records: Any, lists: TileLists, background: Any, settings: Settings) -> Any:
+    J = be.plain
+    tile, state, _ = accumulate(be, records, lists, CHANNELS, settings)
+    behind = [dr.gather(J.Float, background, J.UInt32(f)) for f in range(CHANNELS)]
+    words = dr.empty(J.UInt32, lists.tiles * TILE * WORDS)
+    # A tile's place in rows of `columns` tiles: from the index of its first word in the picture.
+    stride = dr.opaque(J.UInt32, lists.columns * WORDS)
+    first = tile.y * stride + tile.x // TILE * WORDS
+    for row in range(TILE):
+        pixels = state[row * TILE : (row + 1) * TILE]
+        values = [dr.fma(dr.abs(pixel[0]), behind[f], pixel[1 + f]) for pixel in pixels for f in range(CHANNELS)]
+        levels = [J.UInt32(dr.round(255.0 * smaller(larger(value, 0.0), 1.0))) for value in values]
+        for word in range(WORDS):
+            a, b, c, d = levels[4 * word : 4 * word + 4]
+            write(words, a | (b << 8) | (c << 16) | (d << 24), first + (row * stride + word), tile.used)
+    dr.eval(words)
+    return words
