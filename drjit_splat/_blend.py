@@ -77,8 +77,7 @@ def tile_of(be: Backend, index: Any, lists: TileLists, settings: Settings) -> Ti
         index,
         (index - row * columns) * TILE,
         row * TILE,
-        dr.gather(J.UInt32, lists.start, index),
-        dr.gather(J.UInt32, lists.start, index + 1),
+        *lists.span(be, index),
         dr.opaque(J.UInt32, settings.width),
         dr.opaque(J.UInt32, settings.height),
         index < dr.opaque(J.UInt32, lists.tiles),
@@ -115,8 +114,8 @@ def raw_alphas(be: Backend, geometry: list[Any], s: Any, t: Any, settings: Setti
     right = exp2(be, -a * dr.fma(2.0, s, 1.0), degree)
     down = exp2(be, -dr.fma(ah, dr.fma(2.0, s, h), d * dr.fma(2.0, t, 1.0)), degree)
     bend_y = exp2(be, -2.0 * dr.fma(ah, h, d), degree)
-    if not settings.options.exact_tiles:
-        # A tile of the bounding box may lie so far from the ellipse that its corner underflows: nothing is seen there.
+    if not settings.options.exact_tiles or settings.options.list_width > 1:
+        # The list's tile may lie so far from the ellipse that its corner underflows: nothing is seen there.
         seen = exponent > -124.0
         corner, right, down = (dr.select(seen, value, 0.0) for value in (corner, right, down))
     for row in range(TILE):
@@ -191,7 +190,7 @@ def _recorded(be: Backend, features: int, columns: int, rows: int, settings: Set
     """
 
     def run(records: Any, ids: Any, start: Any, order: Any) -> tuple[Any, Any, Any | None, Any]:
-        return _blend(be, records, TileLists(ids, start, order, columns, rows), features, settings)
+        return _blend(be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), features, settings)
 
     return recorded(run)
 

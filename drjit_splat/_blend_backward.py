@@ -60,7 +60,8 @@ def _recorded(
         records: Any, ids: Any, start: Any, order: Any, image: Any, left: Any, end: Any, grad: Any, grad_left: Any
     ) -> Any:
         gradients = dr.zeros(be.plain.Float, capacity * RECORD)
-        lists, blended = TileLists(ids, start, order, columns, rows), Blended(image, left, None, end)
+        lists = TileLists(ids, start, order, columns, rows, settings.options.list_width)
+        blended = Blended(image, left, None, end)
         _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings)
         dr.eval(gradients)
         return gradients

@@ -44,12 +44,13 @@ class Trace:
         count = self.settings.options.count_skips
         if self.lists is None or self.projected is None or not self.chunks:
             return {"occluded_pairs": 0} | ({"box_pairs": 0, "empty_tiles": 0} if count else {})
+        lengths = self.lists.lengths(self.be)
         # Every chunk takes the same decisions, so the first speaks for all.
-        seen: Any = dr.sum(self.lists.lengths(self.be, self.chunks[0].image.end))
-        found = {"occluded_pairs": self.projected.pairs - int(seen[0])}
+        unseen: Any = dr.sum(lengths - self.lists.lengths(self.be, self.chunks[0].image.end))
+        found = {"occluded_pairs": int(unseen[0])}
         if count:
             found["box_pairs"] = self.projected.box_pairs - self.projected.pairs
-            empty: Any = dr.count(self.lists.lengths(self.be) == 0)
+            empty: Any = dr.count(lengths == 0)
             found["empty_tiles"] = int(empty[0])
         return found
 

@@ -27,12 +27,13 @@ class Footprint:
     y: Any
     slope: Any  # dx / dy of the slice centres
     reach: Any  # half height
-    width2: Any  # squared half width of the slice through the centre
+    stretch: Any  # squared ratio of the half width of the slice through the centre to the half height
     turn: Any  # dy of the rightmost point
     first: Any  # first and last tile row, as floats; first > last when there is none
     last: Any
     box: bool = False  # whether every row spans the whole bounding box
     limits: Sequence[Any] | None = None  # first and last tile column that the rules allow
+    tile_width: int = TILE  # pixels
 
     def columns(self, row: Any, image_width: Any) -> tuple[Any, Any]:
         """First and last tile column in tile row `row` (floats); first > last when the row is not touched.
@@ -47,7 +48,7 @@ class Footprint:
         first = larger(dr.ceil(self.x + left - 0.5), 0.0)
         last = smaller(dr.floor(self.x + right - 0.5), image_width - 1.0)
         missed = first > last
-        scale = 1.0 / TILE
+        scale = 1.0 / self.tile_width
         first, last = dr.select(missed, 1.0, dr.floor(first * scale)), dr.select(missed, 0.0, dr.floor(last * scale))
         if self.limits is None:
             return first, last
@@ -55,9 +56,8 @@ class Footprint:
 
     def _edge(self, dy: Any, side: float) -> Any:
         if self.box:
-            return side * dr.sqrt(self.width2)
-        share = dy / self.reach
-        half = dr.sqrt(larger(self.width2 * dr.fma(-share, share, 1.0), 0.0))
+            return side * self.reach * dr.sqrt(self.stretch)
+        half = dr.sqrt(larger(self.stretch * (self.reach - dy) * (self.reach + dy), 0.0))
         return dr.fma(self.slope, dy, side * half)
 
     def clipped(self, rows: Sequence[Any], columns: Sequence[Any]) -> Footprint:
@@ -66,12 +66,12 @@ class Footprint:
 
     def stored(self) -> list[Any]:
         """The eight numbers that `columns` needs besides the limits."""
-        return [self.x, self.y, self.slope, self.reach, self.width2, self.turn, self.first, self.last]
+        return [self.x, self.y, self.slope, self.reach, self.stretch, self.turn, self.first, self.last]
 
     def box_tiles(self, extent_x: Any, image_width: Any) -> Any:
         """Number of tiles of the bounding box, half as wide as `extent_x`."""
-        first = larger(dr.floor((self.x - extent_x) / TILE), 0.0)
-        last = smaller(dr.floor((self.x + extent_x) / TILE), dr.ceil(image_width / TILE) - 1.0)
+        first = larger(dr.floor((self.x - extent_x) / self.tile_width), 0.0)
+        last = smaller(dr.floor((self.x + extent_x) / self.tile_width), dr.ceil(image_width / self.tile_width) - 1.0)
         return larger(last - first + 1.0, 0.0) * larger(self.last - self.first + 1.0, 0.0)
 
 
@@ -90,11 +90,12 @@ def footprint(ellipse: Ellipse, log_opacity: Any, cam: Camera, settings: Setting
         e.y,
         e.xy / e.yy,
         reach,
-        threshold * e.determinant / e.yy if exact else threshold * e.xx,
+        e.determinant / (e.yy * e.yy) if exact else e.xx / e.yy,
         e.xy * dr.sqrt(threshold / e.xx),
         dr.select(missed, 1.0, dr.floor(first * scale)),
         dr.select(missed, 0.0, dr.floor(last * scale)),
         box=not exact,
+        tile_width=TILE * settings.options.list_width,
     )
 
 
@@ -105,17 +106,16 @@ def square_radius(ellipse: Ellipse) -> Any:
     return dr.ceil(3.0 * dr.sqrt(mean + half))
 
 
-def square_limits(x: Any, y: Any, radius: Any, cam: Camera) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+def square_limits(x: Any, y: Any, radius: Any, cam: Camera, tile_width: int) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     """First and last row and column of our tiles in the original's tiles that a square of `radius` touches."""
-    ratio = float(c.TILE_INRIA // TILE)
 
-    def span(centre: Any, size: Any) -> tuple[Any, Any]:
+    def span(centre: Any, size: Any, ratio: int) -> tuple[Any, Any]:
         most = dr.ceil(size / c.TILE_INRIA)
         first = larger(dr.floor((centre - 0.5 - radius) / c.TILE_INRIA), 0.0)
         end = smaller(dr.floor((centre - 0.5 + radius + (c.TILE_INRIA - 1.0)) / c.TILE_INRIA), most)
         return first * ratio, end * ratio - 1.0
 
-    return span(y, cam.height), span(x, cam.width)
+    return span(y, cam.height, c.TILE_INRIA // TILE), span(x, cam.width, c.TILE_INRIA // tile_width)
 
 
 def count_tiles(be: Backend, foot: Footprint, image_width: Any, active: Any) -> Any:

@@ -12,7 +12,7 @@ from . import constants as c
 from ._backend import TILE, Backend, bits_of, packet, power_of_two, smaller, write
 from ._footprint import Footprint
 from ._project import Projected
-from ._settings import Settings
+from ._settings import Options, Settings
 from .profiling import stage
 
 DIGIT_BITS = 12  # widest digit whose bucket counts stay in the first-level cache during a counting pass
@@ -24,24 +24,34 @@ EMIT_BLOCK = 4096  # splats among which lanes are matched; what they emit fits t
 
 @dataclass(frozen=True)
 class TileLists:
-    """For each tile the splats that can touch it, near to far: `ids[start[t]:start[t + 1]]`."""
+    """For each tile the splats that can touch it, near to far: `ids[start[l]:start[l + 1]]` of its list `l`."""
 
     ids: Any  # [pairs] splat of each entry
-    start: Any  # [tiles + 2], the last for the unused tile
+    start: Any  # [lists + 2], the last for the unused tile
     order: Any  # [lanes] the tile that each lane renders, `tiles` in idle lanes
-    columns: int
+    columns: int  # of tiles
     rows: int
+    width: int  # tiles, side by side, that share a list
 
     @property
     def tiles(self) -> int:
         """Number of tiles of the image."""
         return self.columns * self.rows
 
+    def span(self, be: Backend, tile: Any) -> tuple[Any, Any]:
+        """Range of the list of each `tile`; empty for the unused one."""
+        J = be.plain
+        across = -(-self.columns // self.width)
+        if self.width > 1:
+            columns = dr.opaque(J.UInt32, self.columns)
+            row = tile // columns
+            tile = row * dr.opaque(J.UInt32, across) + (tile - row * columns) // self.width
+        return dr.gather(J.UInt32, self.start, tile), dr.gather(J.UInt32, self.start, tile + 1)
+
     def lengths(self, be: Backend, end: Any | None = None) -> Any:
         """Entries of each tile's list, up to `end` [tiles] when it is given."""
-        i = dr.arange(be.plain.UInt32, self.tiles)
-        last = dr.gather(be.plain.UInt32, self.start, i + 1) if end is None else end
-        lengths = last - dr.gather(be.plain.UInt32, self.start, i)
+        first, last = self.span(be, dr.arange(be.plain.UInt32, self.tiles))
+        lengths = (last if end is None else end) - first
         dr.eval(lengths)
         return lengths
 
@@ -83,13 +93,13 @@ def check_pairs(pairs: int, be: Backend) -> None:
     needed = pairs * BYTES_PER_PAIR
     if pairs > c.MAX_PAIRS or (available is not None and needed > available):
         raise MemoryError(
-            f"the splats cover {pairs} ({TILE}x{TILE} tile, splat) pairs, which need {needed / 2**30:.1f} GiB; "
+            f"the splats cover {pairs} (tile, splat) pairs, which need {needed / 2**30:.1f} GiB; "
             "use smaller scales, fewer splats or a smaller image"
         )
 
 
 def _emit(
-    be: Backend, projected: Projected, order: Any, columns: Any, image_width: Any, outside: Any, exact: bool
+    be: Backend, projected: Projected, order: Any, columns: Any, image_width: Any, outside: Any, options: Options
 ) -> tuple[Any, Any]:
     """Tile and splat of every pair, splats in depth order."""
     J = be.plain
@@ -103,7 +113,7 @@ def _emit(
     tile, splat = dr.empty(J.UInt32, projected.pairs), dr.empty(J.UInt32, projected.pairs)
     foot = Footprint(*packet(be, projected.footprints, order, 8))
     limits = None if projected.bounds is None else packet(be, projected.bounds, order, 2)
-    foot = replace(foot, box=not exact, limits=limits)
+    foot = replace(foot, box=not options.exact_tiles, limits=limits, tile_width=TILE * options.list_width)
 
     def body(k: Any, row: Any, column: Any, last: Any) -> tuple[Any, ...]:
         # A count that disagreed with the spans could only send entries to the unused tile, never out of bounds.
@@ -165,18 +175,28 @@ def lane_order(be: Backend, lengths: Any, columns: int, rows: int) -> Any:
 def empty(be: Backend, settings: Settings) -> TileLists:
     """Lists of tiles that no splat touches."""
     J = be.plain
-    columns, rows = -(-settings.width // TILE), -(-settings.height // TILE)
-    ids, start, lengths = (dr.zeros(J.UInt32, size) for size in (1, columns * rows + 2, columns * rows))
-    dr.make_opaque(ids, start, lengths)
-    return TileLists(ids, start, lane_order(be, lengths, columns, rows), columns, rows)
+    columns, rows, across = _grid(settings)
+    ids, start = dr.zeros(J.UInt32, 1), dr.zeros(J.UInt32, across * rows + 2)
+    dr.make_opaque(ids, start)
+    return _ordered(be, TileLists(ids, start, None, columns, rows, settings.options.list_width))
+
+
+def _grid(settings: Settings) -> tuple[int, int, int]:
+    """Columns and rows of tiles, and lists in a row."""
+    columns = -(-settings.width // TILE)
+    return columns, -(-settings.height // TILE), -(-columns // settings.options.list_width)
+
+
+def _ordered(be: Backend, lists: TileLists) -> TileLists:
+    return replace(lists, order=lane_order(be, lists.lengths(be), lists.columns, lists.rows))
 
 
 def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
     """Lists for a projection with at least one pair."""
     J = be.plain
     check_pairs(projected.pairs, be)
-    columns, rows = -(-settings.width // TILE), -(-settings.height // TILE)
-    tiles = columns * rows
+    columns, rows, across = _grid(settings)
+    count = across * rows
     with stage("sort"):
         order = depth_order(be, projected)
     with stage("emit"):
@@ -184,19 +204,18 @@ def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
             be,
             projected,
             order,
-            dr.opaque(J.UInt32, columns),
+            dr.opaque(J.UInt32, across),
             dr.opaque(J.Float, float(settings.width)),
-            dr.opaque(J.UInt32, tiles),
-            settings.options.exact_tiles,
+            dr.opaque(J.UInt32, count),
+            settings.options,
         )
     with stage("bin"):
-        by_tile = _by_tile(be, tile, tiles, projected.pairs)
+        by_tile = _by_tile(be, tile, count, projected.pairs)
     with stage("lists"):
-        start = _starts(be, tile, by_tile, tiles, projected.pairs)
+        start = _starts(be, tile, by_tile, count, projected.pairs)
         ids = dr.gather(J.UInt32, splat, by_tile)
         dr.eval(start, ids)
-        lists = TileLists(ids, start, None, columns, rows)
-        return replace(lists, order=lane_order(be, lists.lengths(be), columns, rows))
+        return _ordered(be, TileLists(ids, start, None, columns, rows, settings.options.list_width))
 
 
 def _by_tile(be: Backend, tile: Any, tiles: int, pairs: int) -> Any:

@@ -129,7 +129,7 @@ def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Ca
     limits = None
     if settings.inria:
         radius_x = radius_y = square_radius(e)
-        rows, limits = square_limits(e.x, e.y, radius_x, cam)
+        rows, limits = square_limits(e.x, e.y, radius_x, cam, foot.tile_width)
         foot = foot.clipped(rows, limits)
         on_screen &= (rows[0] <= rows[1]) & (limits[0] <= limits[1])
     large = (radius_x > cam.radius_clip) | (radius_y > cam.radius_clip)

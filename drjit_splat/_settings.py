@@ -23,6 +23,7 @@ class Options:
         exact_tiles: list only the tiles that a splat's ellipse reaches, not its whole bounding box.
         opacity_extent: let a faint splat's footprint shrink; otherwise all reach as far as an opaque one.
         stop_early: leave a tile's list once all its pixels have stopped.
+        list_width: 4x4 tiles, side by side, that share a list: 1, 2 or 4. More make the lists sooner and blend later.
         cull_offscreen: drop splats whose footprint misses the image before they are sorted.
         count_skips: add `box_pairs` and `empty_tiles` to `meta["n_culled"]`.
 
@@ -35,6 +36,7 @@ class Options:
     exact_tiles: bool = True
     opacity_extent: bool = True
     stop_early: bool = True
+    list_width: int = 1
     cull_offscreen: bool = True
     count_skips: bool = False
 
@@ -46,6 +48,8 @@ class Options:
             raise ValueError(f"transmittance_min must lie in [1e-30, 1), not {self.transmittance_min}")
         if self.exp_degree not in (3, 4, 5):
             raise ValueError(f"exp_degree must be 3, 4 or 5, not {self.exp_degree!r}")
+        if self.list_width not in (1, 2, 4):
+            raise ValueError(f"list_width must be 1, 2 or 4, not {self.list_width!r}")
 
 
 @dataclass(frozen=True)

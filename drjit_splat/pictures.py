@@ -16,10 +16,11 @@ from ._backend import RECORDINGS, TILE, Backend, backend_named, exclusive, large
 from ._blend import accumulate
 from ._lists import TileLists
 from ._project import Arrays, Queued
-from ._settings import Settings
+from ._settings import Options, Settings
 from .profiling import stage
 
 CHANNELS = 3
+OPTIONS = Options(list_width=2)  # the quickest without the adjoint
 WORDS = TILE * CHANNELS // 4  # 32-bit words that hold the bytes of a tile's row
 
 
@@ -62,7 +63,7 @@ class Exposure:
         if projected.nonfinite:
             raise ValueError("every value of the splats and the camera must be finite in float32")
         lists = _lists.build(be, projected, self.settings) if projected.pairs else _lists.empty(be, self.settings)
-        kernel = _recorded(be, lists.columns, lists.rows, self.settings)
+        kernel = _printing(be, lists.columns, lists.rows, self.settings)
         with stage("blend"):
             words = kernel(projected.records, lists.ids, lists.start, lists.order, background)
         return Picture(words, self.settings.width, self.settings.height)
@@ -92,19 +93,30 @@ def expose(
         RuntimeError: no LLVM library was found; the message says what to install.
     """
     be = backend_named(True)
-    settings = Settings(width, height)
+    settings = Settings(width, height, options=OPTIONS)
     settings.check()
-    count = dr.width(opacities)
-    arrays = Arrays(count, CHANNELS, means, quats, scales, None, opacities, colors, view, intrinsics)
-    return Exposure(settings, _core.queue(be, arrays, settings, CHANNELS))
+    project = _projection(be, dr.width(opacities), settings)
+    with stage("project"):
+        return Exposure(settings, Queued(*project(means, quats, scales, opacities, colors, view, intrinsics)))
 
 
 @lru_cache(maxsize=RECORDINGS)
-def _recorded(be: Backend, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
+def _projection(be: Backend, count: int, settings: Settings) -> Callable[..., Any]:
+    """The projection of `count` splats, traced at its first call."""
+
+    def run(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, view: Any, intrinsics: Any) -> Any:
+        arrays = Arrays(count, CHANNELS, means, quats, scales, None, opacities, colors, view, intrinsics)
+        return tuple(vars(_core.queue(be, arrays, settings, CHANNELS)).values())
+
+    return recorded(run)
+
+
+@lru_cache(maxsize=RECORDINGS)
+def _printing(be: Backend, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
     """The kernel of one image size, traced at its first call; see `_blend._recorded`."""
 
     def run(records: Any, ids: Any, start: Any, order: Any, background: Any) -> Any:
-        return _print(be, records, TileLists(ids, start, order, columns, rows), background, settings)
+        return _print(be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), background, settings)
 
     return recorded(run)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
 import drjit as dr
@@ -89,7 +91,15 @@ class Rig:
         from drjit.llvm import Float
 
         points, towards = (Float(given.detach().float().contiguous().view(-1)) for given in (vertices, turn))
-        return self._carried(self._vertices(points, self._triangles(points, towards)))
+        fixed = (self.records, self.corners, self.rest, self.fans, self.fan_faces, self.rest_area)
+        run = _recorded(self.count, dr.width(self.corners), dr.width(self.rest_area))
+        return Posed(*run(points, towards, *fixed)[:3])
+
+    def _posed(self, points: Any, towards: Any) -> tuple[Any, ...]:
+        """What `Posed` holds, and what was made on the way."""
+        triangles = self._triangles(points, towards)
+        moved = self._vertices(points, triangles)
+        return *self._carried(moved), triangles, moved
 
     def _triangles(self, points: Any, towards: Any) -> Any:
         """Rotation (wxyz) times canonical area, and posed area, of each triangle [F * 8], padded."""
@@ -173,6 +183,18 @@ class Rig:
         dr.scatter(quats, ArrayXf(quat), i, mode=dr.ReduceMode.Permute)
         dr.eval(means, quats, scales)
         return Posed(means, quats, scales)
+
+
+@lru_cache(maxsize=8)
+def _recorded(count: int, corners: int, vertices: int) -> Callable[..., Any]:
+    """Posing on heads of one size, traced at the first call: tracing takes as long as the kernels run."""
+
+    # Repeating a trace goes wrong where an array that is written to is not among the results.
+    @dr.freeze(state_fn=None)
+    def run(points: Any, towards: Any, *fixed: Any) -> tuple[Any, ...]:
+        return Rig(count, *fixed)._posed(points, towards)
+
+    return run
 
 
 def _rest(vertices: Tensor, faces: Tensor) -> Tensor:
