@@ -70,6 +70,7 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
     cameras = motion_cameras(avatar, motion, size)
     params = motion.parameters(avatar.identity)
     found: dict[str, list[float]] = {}
+    picture = None
     for first in range(0, count, 16):
         start = time.perf_counter()
         vertices, turns = stage.meshes(params[first : first + 16])
@@ -83,7 +84,7 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
             found.setdefault("pose", []).append(1e3 * (time.perf_counter() - start))
             with profile() as report:
                 start = time.perf_counter()
-                stage.develop(stage.expose(mesh, turn, view))
+                picture = stage.develop(stage.expose(mesh, turn, view), picture)
                 dr.sync_thread()
                 found.setdefault("frame", []).append(1e3 * (time.perf_counter() - start))
             for name, spent in report.stages.items():

@@ -187,12 +187,15 @@ def _grid(settings: Settings) -> tuple[int, int, int]:
     return columns, -(-settings.height // TILE), -(-columns // settings.options.list_width)
 
 
-def _ordered(be: Backend, lists: TileLists) -> TileLists:
-    return replace(lists, order=lane_order(be, lists.lengths(be), lists.columns, lists.rows))
+def _ordered(be: Backend, lists: TileLists, work: Any | None = None) -> TileLists:
+    work = lists.lengths(be) if work is None else work
+    return replace(lists, order=lane_order(be, work, lists.columns, lists.rows))
 
 
-def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
-    """Lists for a projection with at least one pair."""
+def build(be: Backend, projected: Projected, settings: Settings, work: Any | None = None) -> TileLists:
+    """Lists for a projection with at least one pair; lanes are matched by the `work` [tiles] expected of each tile, or
+    by the lengths of the lists.
+    """
     J = be.plain
     check_pairs(projected.pairs, be)
     columns, rows, across = _grid(settings)
@@ -215,7 +218,7 @@ def build(be: Backend, projected: Projected, settings: Settings) -> TileLists:
         start = _starts(be, tile, by_tile, count, projected.pairs)
         ids = dr.gather(J.UInt32, splat, by_tile)
         dr.eval(start, ids)
-        return _ordered(be, TileLists(ids, start, None, columns, rows, settings.options.list_width))
+        return _ordered(be, TileLists(ids, start, None, columns, rows, settings.options.list_width), work)
 
 
 def _by_tile(be: Backend, tile: Any, tiles: int, pairs: int) -> Any:

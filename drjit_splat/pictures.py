@@ -29,6 +29,7 @@ class Picture:
     """A picture that may still be in the making."""
 
     words: Any  # whole tiles, row by row, each pixel's three bytes after those of its left neighbour
+    work: Any  # [tiles] list entries that each tile took
     width: int
     height: int
 
@@ -48,11 +49,13 @@ class Exposure:
     queued: Queued
 
     @exclusive
-    def develop(self, background: Any) -> Picture:
+    def develop(self, background: Any, like: Picture | None = None) -> Picture:
         """Wait for the projection and begin to blend.
 
         Args:
             background: [3] in [0, 1], a flat Dr.Jit array.
+            like: an earlier picture of this size, best the last of the film. What its tiles took tells which of this
+                one's should be blended side by side; it changes no pixel.
 
         Raises:
             ValueError: a value of a splat or the camera is not finite.
@@ -62,11 +65,12 @@ class Exposure:
         projected = self.queued.result()
         if projected.nonfinite:
             raise ValueError("every value of the splats and the camera must be finite in float32")
-        lists = _lists.build(be, projected, self.settings) if projected.pairs else _lists.empty(be, self.settings)
+        work = None if like is None else like.work
+        lists = _lists.build(be, projected, self.settings, work) if projected.pairs else _lists.empty(be, self.settings)
         kernel = _printing(be, lists.columns, lists.rows, self.settings)
         with stage("blend"):
-            words = kernel(projected.records, lists.ids, lists.start, lists.order, background)
-        return Picture(words, self.settings.width, self.settings.height)
+            words, work = kernel(projected.records, lists.ids, lists.start, lists.order, background)
+        return Picture(words, work, self.settings.width, self.settings.height)
 
 
 @exclusive
@@ -123,7 +127,7 @@ def _printing(be: Backend, columns: int, rows: int, settings: Settings) -> Calla
 
 def _print(be: Backend, records: Any, lists: TileLists, background: Any, settings: Settings) -> Any:
     J = be.plain
-    tile, state, _ = accumulate(be, records, lists, CHANNELS, settings)
+    tile, state, last = accumulate(be, records, lists, CHANNELS, settings)
     behind = [dr.gather(J.Float, background, J.UInt32(f)) for f in range(CHANNELS)]
     words = dr.empty(J.UInt32, lists.tiles * TILE * WORDS)
     # A tile's place in rows of `columns` tiles: from the index of its first word in the picture.
@@ -136,5 +140,7 @@ def _print(be: Backend, records: Any, lists: TileLists, background: Any, setting
         for word in range(WORDS):
             a, b, c, d = levels[4 * word : 4 * word + 4]
             write(words, a | (b << 8) | (c << 16) | (d << 24), first + (row * stride + word), tile.used)
-    dr.eval(words)
-    return words
+    work = dr.empty(J.UInt32, lists.tiles)
+    write(work, last - tile.first, tile.index, tile.used)
+    dr.eval(words, work)
+    return words, work

@@ -71,9 +71,9 @@ class Stage:
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
         return expose(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
 
-    def develop(self, exposure: Exposure) -> Picture:
-        """Wait for an exposure's projection and queue the rest."""
-        return exposure.develop(self._background)
+    def develop(self, exposure: Exposure, last: Picture | None = None) -> Picture:
+        """Wait for an exposure's projection and queue the rest; quicker with the `last` picture of the film."""
+        return exposure.develop(self._background, last)
 
 
 def film(
@@ -118,7 +118,7 @@ def film(
             vertices, turns = stage.meshes(params[index : index + _BLOCK])
         exposure = stage.expose(vertices[place], turns[place], path[index])
         done = None if picture is None else picture.numpy()
-        picture = stage.develop(exposure)
+        picture = stage.develop(exposure, picture)
         if done is not None:
             yield done
     if picture is not None:
