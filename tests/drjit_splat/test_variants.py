@@ -63,6 +63,8 @@ def test_inria_rules_cut_squares_and_near_splats() -> None:
         Options(opacity_extent=False),
         Options(stop_early=False),
         Options(cull_offscreen=False),
+        Options(list_width=2),
+        Options(list_width=4, exact_tiles=False),
         Options(exact_tiles=False, opacity_extent=False, stop_early=False, cull_offscreen=False),
     ],
 )
@@ -103,7 +105,7 @@ def test_counters_state_what_skips_saved() -> None:
     assert culled["empty_tiles"] > 100
 
 
-@pytest.mark.parametrize("value", [{"alpha_min": 0.0}, {"transmittance_min": 1.0}, {"exp_degree": 6}])
+@pytest.mark.parametrize("value", [{"alpha_min": 0.0}, {"transmittance_min": 1.0}, {"exp_degree": 6}, {"list_width": 3}])
 def test_options_out_of_range_are_named(value: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(value))):
         Options(**value)
@@ -132,3 +134,11 @@ def test_conics_are_the_inverse_covariances() -> None:
     wanted = torch.stack([p.covariance[:, 2], -p.covariance[:, 1], p.covariance[:, 0]], -1) / p.determinant[:, None]
     assert torch.allclose(meta["conics"][0].double(), wanted, rtol=1e-3, atol=1e-5)
     assert {"means2d", "radii", "n_pairs", "width", "opacities"} <= set(meta)
+
+
+def test_shared_lists_obey_other_rules_too() -> None:
+    scene = random_scene(width=61, height=47)
+    image = rasterization(**scene, width=61, height=47, semantics="inria")[0]
+    for width in (2, 4):
+        shared = rasterization(**scene, width=61, height=47, semantics="inria", options=Options(list_width=width))
+        assert torch.equal(shared[0], image)

@@ -1,0 +1,80 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from drjit_splat import rasterization, reference
+from drjit_splat.pictures import Picture, expose
+from tests.drjit_splat.common import random_scene
+
+SIZE = (61, 47)
+
+
+def flat(values: Tensor) -> Any:
+    from drjit.llvm import Float
+
+    return Float(values.flatten().numpy())
+
+
+def picture(scene: dict[str, Tensor], size: tuple[int, int] = SIZE, like: Picture | None = None) -> Picture:
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    return expose(*(flat(scene[name]) for name in names), *size).develop(flat(scene["backgrounds"]), like)
+
+
+def test_bytes_are_the_oracles_rounded() -> None:
+    width, height = SIZE
+    scene = random_scene(width=width, height=height)
+    depths = rasterization(**scene, width=width, height=height)[2]["depths"]
+    double = {name: value.double() for name, value in scene.items()}
+    order = torch.argsort(depths, dim=-1, stable=True)
+    image, _, meta = reference.rasterization(**double, width=width, height=height, order=order)
+    levels = 255 * image[0].clamp(0, 1).numpy()
+    trusted = (meta["margin"][0] > 1e-4).numpy()
+    error = np.abs(picture(scene).numpy() - levels)[trusted]
+    assert trusted.mean() > 0.95 and error.max() < 0.5 + 1e-3
+    assert error.mean() > 0.2  # of values that are rounded, a quarter
+
+
+@pytest.mark.parametrize("size", [(64, 64), (8, 4), (7, 5), (1, 1), (130, 3)])
+def test_every_size_is_that_of_the_torch_interface(size: tuple[int, int]) -> None:
+    width, height = size
+    scene = random_scene(width=width, height=height)
+    image = rasterization(**scene, width=width, height=height)[0][0]
+    bytes_ = picture(scene, size).numpy()
+    assert bytes_.shape == (height, width, 3)
+    assert np.abs(bytes_ - 255 * image.clamp(0, 1).numpy()).max() <= 0.5 + 1e-3
+
+
+def test_an_earlier_picture_changes_no_pixel() -> None:
+    scenes = [random_scene(width=SIZE[0], height=SIZE[1], seed=seed) for seed in range(3)]
+    alone = [picture(scene).numpy() for scene in scenes]
+    last = None
+    for scene, wanted in zip(scenes, alone, strict=True):
+        last = picture(scene, like=last)
+        assert np.array_equal(last.numpy(), wanted)
+    assert np.array_equal(picture(scenes[0]).numpy(), alone[0])
+
+
+def test_frames_may_overlap() -> None:
+    scenes = [random_scene(width=SIZE[0], height=SIZE[1], seed=seed) for seed in range(2)]
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    exposures = [expose(*(flat(scene[name]) for name in names), *SIZE) for scene in scenes]
+    pictures = [e.develop(flat(s["backgrounds"])) for e, s in zip(exposures, scenes, strict=True)]
+    for found, scene in zip(pictures, scenes, strict=True):
+        assert np.array_equal(found.numpy(), picture(scene).numpy())
+
+
+def test_nothing_in_view_leaves_the_background() -> None:
+    scene = random_scene(count=20)
+    scene["means"][:, 2] -= 100
+    found = picture(scene).numpy()
+    assert (found == np.round(255 * scene["backgrounds"][0].numpy()).astype(np.uint8)).all()
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    scene = random_scene(count=20)
+    scene["scales"][3, 1] = torch.nan
+    with pytest.raises(ValueError, match="finite"):
+        picture(scene)
