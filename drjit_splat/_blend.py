@@ -190,7 +190,9 @@ def _recorded(be: Backend, features: int, columns: int, rows: int, settings: Set
     """
 
     def run(records: Any, ids: Any, start: Any, order: Any) -> tuple[Any, Any, Any | None, Any]:
-        return _blend(be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), features, settings)
+        return _blend(
+            be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), features, settings
+        )
 
     return recorded(run)
 

@@ -90,7 +90,7 @@ def footprint(ellipse: Ellipse, log_opacity: Any, cam: Camera, settings: Setting
         e.y,
         e.xy / e.yy,
         reach,
-        e.determinant / (e.yy * e.yy) if exact else e.xx / e.yy,
+        e.determinant / e.yy / e.yy if exact else e.xx / e.yy,
         e.xy * dr.sqrt(threshold / e.xx),
         dr.select(missed, 1.0, dr.floor(first * scale)),
         dr.select(missed, 0.0, dr.floor(last * scale)),

@@ -79,8 +79,13 @@ class Queued:
         """The same once the kernel has ended; waits for it."""
         totals = [int(total) for total in self.tally.numpy()]
         culled = {name: totals[code] for code, name in enumerate(CULLED) if code}
-        return Projected(**vars(self), pairs=totals[PAIRS], box_pairs=totals[BOX_PAIRS], culled=culled,
-            nonfinite=totals[NONFINITE] > 0)
+        return Projected(
+            **vars(self),
+            pairs=totals[PAIRS],
+            box_pairs=totals[BOX_PAIRS],
+            culled=culled,
+            nonfinite=totals[NONFINITE] > 0,
+        )
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,15 @@ class Exposure:
 
 @exclusive
 def expose(
-    means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, view: Any, intrinsics: Any, width: int, height: int
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    colors: Any,
+    view: Any,
+    intrinsics: Any,
+    width: int,
+    height: int,
 ) -> Exposure:
     """Begin to project N >= 1 splats, for a picture as `rasterization` makes it, rounded to bytes.
 
@@ -120,7 +128,9 @@ def _printing(be: Backend, columns: int, rows: int, settings: Settings) -> Calla
     """The kernel of one image size, traced at its first call; see `_blend._recorded`."""
 
     def run(records: Any, ids: Any, start: Any, order: Any, background: Any) -> Any:
-        return _print(be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), background, settings)
+        return _print(
+            be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), background, settings
+        )
 
     return recorded(run)
 

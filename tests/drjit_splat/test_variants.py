@@ -63,8 +63,6 @@ def test_inria_rules_cut_squares_and_near_splats() -> None:
         Options(opacity_extent=False),
         Options(stop_early=False),
         Options(cull_offscreen=False),
-        Options(list_width=2),
-        Options(list_width=4, exact_tiles=False),
         Options(exact_tiles=False, opacity_extent=False, stop_early=False, cull_offscreen=False),
     ],
 )
@@ -105,7 +103,9 @@ def test_counters_state_what_skips_saved() -> None:
     assert culled["empty_tiles"] > 100
 
 
-@pytest.mark.parametrize("value", [{"alpha_min": 0.0}, {"transmittance_min": 1.0}, {"exp_degree": 6}, {"list_width": 3}])
+@pytest.mark.parametrize(
+    "value", [{"alpha_min": 0.0}, {"transmittance_min": 1.0}, {"exp_degree": 6}, {"list_width": 3}]
+)
 def test_options_out_of_range_are_named(value: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(value))):
         Options(**value)
@@ -136,9 +136,21 @@ def test_conics_are_the_inverse_covariances() -> None:
     assert {"means2d", "radii", "n_pairs", "width", "opacities"} <= set(meta)
 
 
-def test_shared_lists_obey_other_rules_too() -> None:
+@pytest.mark.parametrize("semantics", ["gsplat", "inria"])
+@pytest.mark.parametrize(
+    "options", [Options(list_width=2), Options(list_width=4), Options(list_width=2, exact_tiles=False)]
+)
+def test_shared_lists_are_shorter_and_change_no_pixel(options: Options, semantics: str) -> None:
     scene = random_scene(width=61, height=47)
-    image = rasterization(**scene, width=61, height=47, semantics="inria")[0]
-    for width in (2, 4):
-        shared = rasterization(**scene, width=61, height=47, semantics="inria", options=Options(list_width=width))
-        assert torch.equal(shared[0], image)
+    scene["scales"][100:150] *= torch.tensor([40.0, 0.01, 0.01])
+    image, gradients, meta = render_with_gradients(scene, 61, 47, semantics=semantics)
+    shared, shared_gradients, shared_meta = render_with_gradients(scene, 61, 47, semantics=semantics, options=options)
+    assert torch.equal(image, shared)
+    for name, gradient in gradients.items():
+        assert float((gradient - shared_gradients[name]).norm()) <= 1e-5 * float(gradient.norm()), name
+    alone = (
+        meta
+        if options.exact_tiles
+        else rasterization(**scene, width=61, height=47, options=Options(exact_tiles=False))[2]
+    )
+    assert shared_meta["n_pairs"][0] < 0.8 * alone["n_pairs"][0]
