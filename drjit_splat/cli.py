@@ -71,14 +71,14 @@ def load_camera(path: str | Path, index: int = 0) -> View:
     """
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON ({error})") from None
     cameras = found if isinstance(found, list) else [found]
     if not 0 <= index < len(cameras):
         raise ValueError(f"{path} has {len(cameras)} cameras; there is no camera {index}")
     try:
         return _view(cameras[index])
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, RuntimeError) as error:
         raise ValueError(f"{path}: camera {index} cannot be used ({type(error).__name__}: {error})") from None
 
 

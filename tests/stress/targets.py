@@ -30,7 +30,7 @@ from uika.motion import Motion, MotionError, load_motion, save_motion
 from uika.photo import PhotoError
 from uika.photo.read import read
 
-from . import mutate
+from . import more_targets, mutate
 
 
 @dataclass(frozen=True)
@@ -220,4 +220,4 @@ TARGETS = {
     "motion_json": Target(_poses, mutate.text, read_json, MotionError),
     "transforms": Target(captures, mutate.text, _read_capture, DataError),
     "shard": Target(_shards, mutate.tar, _read_shard, DataError),
-}
+} | {name: Target(*parts) for name, parts in more_targets.TARGETS.items()}

@@ -42,13 +42,13 @@ def external_picture(folder: Path, sequence: str, views: int, target: str, size:
     Raises:
         UikaError: it cannot be read or has another size.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     file = external_file(folder, sequence, views, target)
     try:
         with Image.open(file) as image:
             pixels = np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except Exception as error:  # decoders meet hostile bytes with many exception types
         raise UikaError(f"{file}: cannot be read as a picture ({error})") from error
     if pixels.shape[:2] != (size, size):
         raise UikaError(f"{file}: has {pixels.shape[1]}x{pixels.shape[0]} pixels, not {size}x{size} as --size says")

@@ -152,7 +152,7 @@ def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
         document = json.loads(data[20 : 20 + size])
         if not isinstance(document, dict):
             raise ValueError("its JSON is no object")
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, RecursionError) as error:
         raise UikaError(f"{path}: is damaged or no .glb file ({error})") from error
     return document, data[20 + size + 8 :]
 

@@ -92,7 +92,7 @@ def html_provenance(path: str | Path) -> dict[str, str]:
     try:
         scene, _ = json.JSONDecoder().raw_decode(text, start + len(_SCENE_TAG))
         return {str(key): str(value) for key, value in scene["provenance"].items()}
-    except (json.JSONDecodeError, KeyError, AttributeError, TypeError):
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
         return {}
 
 

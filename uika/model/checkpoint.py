@@ -83,8 +83,11 @@ def load_checkpoint(path: str | Path) -> Reconstructor:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such model file")
     config, tensors = _read(path)
-    with torch.device("meta"):
-        model = Reconstructor(config)
+    try:
+        with torch.device("meta"):
+            model = Reconstructor(config)
+    except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError) as error:
+        raise CheckpointError(f"{path}: its config describes no model ({error})") from error
     expected = model.state_dict()
     problems = [
         listing("missing", [name for name in expected if name not in tensors]),
@@ -115,13 +118,24 @@ def _read(path: Path) -> tuple[ModelConfig, dict[str, Tensor]]:
                     f"{path}: version {metadata.get('version', 'unknown')} of the format, this program reads {VERSION}"
                 )
             config = ModelConfig.from_dict(json.loads(metadata["config"]))
+            check_depth(path, config.layers + config.backbone.depth, len(file.keys()))
             return config, {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise CheckpointError(f"{path}: damaged or truncated safetensors file ({error})") from error
     except CheckpointError:
         raise
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         raise CheckpointError(f"{path}: unreadable config in the header ({error})") from error
+
+
+def check_depth(path: str | Path, blocks: int, tensors: int) -> None:
+    """Refuse a config of more blocks than its file has tensors, before they are built.
+
+    Raises:
+        CheckpointError: it names the file.
+    """
+    if blocks > tensors:
+        raise CheckpointError(f"{path}: its config speaks of {blocks} blocks, but the file holds {tensors} tensors")
 
 
 def listing(kind: str, names: list[str]) -> str:

@@ -20,7 +20,8 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm")
 DATA = (".safetensors", ".glb", ".ply", ".html")
 _FRAMES = 12  # of a video that are looked at
-_MAX_PIXELS = 100_000_000
+_MAX_PIXELS = 36_000_000  # a picture of 8K fits
+_PIXELS_KEPT = 64_000_000  # of all frames that are looked at together
 _KEY = "provenance"
 _HEADER = 1 << 16
 
@@ -65,11 +66,12 @@ def _picture(path: Path) -> Finding:
 
     try:
         with Image.open(path) as picture:
-            if picture.width * picture.height > _MAX_PIXELS:
-                raise UikaError(f"{path}: has {picture.width}x{picture.height} pixels; {_MAX_PIXELS:,} are the most")
+            _check_size(path, picture.width, picture.height)
             text = picture.info.get(_KEY) or picture.info.get("comment") or ""
-            rgb = torch.from_numpy(np.array(picture.convert("RGB"))).float() / 255
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+            rgb = torch.from_numpy(np.array(picture.convert("RGB"))).float().div_(255)
+    except UikaError:
+        raise
+    except Exception as error:  # decoders meet hostile bytes with many exception types
         raise UikaError(f"{path}: is no picture that can be read ({error})") from error
     if isinstance(text, bytes):
         text = text.decode("utf-8", "replace")
@@ -80,18 +82,25 @@ def _video(path: Path) -> Finding:
     import av
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             text = container.metadata.get("comment") or container.metadata.get("COMMENT") or ""
-            pictures = _spread(container)
-    except (av.FFmpegError, OSError) as error:
+            frames = _spread(path, container)
+    except UikaError:
+        raise
+    except (av.FFmpegError, OSError, ValueError) as error:
         raise UikaError(f"{path}: is no video that can be read ({error})") from error
-    if not pictures:
+    if not frames:
         raise UikaError(f"{path}: has no pictures")
-    return Finding(_parsed(text), detect(pictures))
+    return Finding(_parsed(text), detect(frame.float().div_(255) for frame in frames))
 
 
-def _spread(container: Any) -> list[Tensor]:
-    """Some frames from the whole of a video, the first among them."""
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > _MAX_PIXELS:
+        raise UikaError(f"{path}: has {width}x{height} pixels; {_MAX_PIXELS:,} are the most")
+
+
+def _spread(path: Path, container: Any) -> list[Tensor]:
+    """Some frames [H,W,3] of 8 bits from the whole of a video, the first among them."""
     if not container.streams.video:
         return []
     kept: list[Tensor] = []
@@ -99,8 +108,10 @@ def _spread(container: Any) -> list[Tensor]:
     for index, frame in enumerate(container.decode(video=0)):
         if index % step:
             continue
-        kept.append(torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255)
-        if len(kept) == 2 * _FRAMES:  # a video's length is only known at its end
+        _check_size(path, frame.width, frame.height)
+        kept.append(torch.from_numpy(frame.to_ndarray(format="rgb24")))
+        most = max(2, min(2 * _FRAMES, _PIXELS_KEPT // (frame.width * frame.height)))
+        if len(kept) >= most:  # a video's length is only known at its end
             kept, step = kept[::2], 2 * step
     return kept[:: max(1, len(kept) // _FRAMES)]
 
@@ -137,5 +148,5 @@ def _comments(path: Path) -> dict[str, str]:
 def _parsed(text: str) -> Mapping[str, str]:
     try:
         return as_text(json.loads(text))
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return {}

@@ -15,6 +15,7 @@ from uika.errors import UikaError
 
 AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say
+MAX_PIXELS = 36_000_000  # of a frame; 8K has fewer
 
 
 class VideoError(UikaError):
@@ -42,16 +43,23 @@ def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8]
     if not path.is_file():
         raise VideoError(f"{path}: no such video")
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video:
                 raise VideoError(f"{path}: has no pictures in it")
             container.streams.video[0].thread_type = "AUTO"
             for frame in container.decode(video=0):
+                if frame.width * frame.height > MAX_PIXELS:
+                    raise VideoError(
+                        f"{path}: has {frame.width}x{frame.height} pixels a frame; {MAX_PIXELS:,} are the most"
+                    )
                 grey: Any = frame.to_ndarray(format="gray")
                 rgb: Any = frame.to_ndarray(format="rgb24") if colour else grey[:0]
                 yield grey, rgb
-    except av.FFmpegError as error:
-        raise VideoError(f"{path}: cannot be read as a video ({error.strerror})") from error
+    except VideoError:
+        raise
+    except (av.FFmpegError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise VideoError(f"{path}: cannot be read as a video ({reason})") from error
 
 
 def decode_ahead(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
@@ -89,9 +97,16 @@ def decode_ahead(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.
 
 
 def frame_rate(path: Path) -> float:
-    """Frames per second."""
+    """Frames per second.
+
+    Raises:
+        VideoError: the file is no video.
+    """
     import av
 
-    with av.open(str(path)) as container:
-        rate = container.streams.video[0].average_rate
-        return float(rate) if rate else DEFAULT_FPS
+    try:
+        with av.open(str(path), metadata_errors="replace") as container:
+            rate = container.streams.video[0].average_rate
+    except (av.FFmpegError, OSError, LookupError) as error:
+        raise VideoError(f"{path}: cannot be read as a video ({error})") from error
+    return float(rate) if rate else DEFAULT_FPS

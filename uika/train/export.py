@@ -15,6 +15,7 @@ from torch import Tensor
 from uika._version import __version__
 from uika.files import replacing
 from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, save_checkpoint
+from uika.model.checkpoint import check_depth
 from uika.model.config import BackboneConfig
 from uika.train.checkpoint import Progress
 from uika.train.config import TrainConfig
@@ -62,11 +63,14 @@ def load_estimator(path: str | Path) -> Estimator:
                 raise CheckpointError(f"{path}: not a {ESTIMATOR_FORMAT} file of version {_VERSION}")
             config = json.loads(header["config"])
             backbone = BackboneConfig(**_tuples(config.pop("backbone")))
-            model = Estimator(EstimatorConfig(backbone=backbone, **_tuples(config)))
-            model.load_state_dict({name: file.get_tensor(name).float() for name in file.keys()})  # noqa: SIM118
+            check_depth(path, backbone.depth + config.get("layers", 0), len(file.keys()))
+            with torch.device("meta"):
+                model = Estimator(EstimatorConfig(backbone=backbone, **_tuples(config)))
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+            model.load_state_dict(tensors, assign=True)
     except CheckpointError:
         raise
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (OSError, SafetensorError, LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: cannot be read as an estimator ({error})") from error
     return model.eval()
 

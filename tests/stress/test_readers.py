@@ -1,0 +1,133 @@
+"""Damaged files that once got past a reader's documented refusal; `tests.stress.fuzz` found them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from drjit_splat.cli import load_camera
+from uika.errors import UikaError
+from uika.export import glb_provenance, html_provenance, read_glb
+from uika.model import CheckpointError, load_checkpoint
+from uika.safeguards import verify
+from uika.tracking.decode import decode, frame_rate
+from uika.video import write_video
+
+from .targets import TARGETS
+
+DEEP = b'{"a":' * 100_000
+
+
+def _seed(name: str, folder: Path) -> Path:
+    return TARGETS[name].seeds(folder)[0]
+
+
+@pytest.mark.parametrize("json_chunk", [DEEP, b"[" * 100_000])
+def test_a_glb_nested_too_deep(json_chunk: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    total = 20 + len(json_chunk)
+    path.write_bytes(struct.pack("<4sIIII", b"glTF", 2, total, len(json_chunk), 0x4E4F534A) + json_chunk)
+    for reader in (glb_provenance, read_glb, verify):
+        with pytest.raises(UikaError, match=r"a\.glb: is damaged"):
+            reader(path)
+
+
+@pytest.mark.parametrize("scene", [DEEP.decode(), '{"provenance": {"a": ' + "9" * 5000 + "}}"])
+def test_a_page_whose_scene_cannot_be_parsed_has_no_provenance(scene: str, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(f'<script id="scene" type="application/json">{scene}')
+    assert html_provenance(tmp_path / "a.html") == {}
+
+
+@pytest.mark.parametrize("text", [DEEP.decode(), "9" * 5000, '[{"width": 1e400, "height": 3}]'])
+def test_cameras_that_python_cannot_parse(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=r"a\.json"):
+        load_camera(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("field", ["fx", "position", "rotation", "width"])
+def test_cameras_with_numbers_that_no_float_holds(field: str, tmp_path: Path) -> None:
+    camera = json.loads((TARGETS["camera"].seeds(tmp_path)[1]).read_text())
+    camera[field] = 10**400
+    (tmp_path / "a.json").write_text(json.dumps(camera))
+    with pytest.raises(ValueError, match=r"a\.json: camera 0 cannot be used"):
+        load_camera(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"backbone": 1.5}, "unreadable config"),
+        ({"backbone": True}, "unreadable config"),
+        ({"gaussians": "x"}, "unreadable config"),
+        ({"layers": 10**9, "outputs": [1, 2, 3, 10**9]}, "speaks of"),
+        ({"layers": "4"}, "config"),
+        ({"dim": -16}, "."),
+    ],
+)
+def test_models_whose_config_makes_no_sense(change: dict[str, object], words: str, tmp_path: Path) -> None:
+    path = _seed("model", tmp_path)
+    _change_config(path, lambda config: json.dumps(json.loads(config) | change))
+    with pytest.raises(CheckpointError, match=rf"a\.safetensors: .*{words}"):
+        load_checkpoint(path)
+
+
+def test_a_model_whose_config_is_nested_too_deep(tmp_path: Path) -> None:
+    path = _seed("model", tmp_path)
+    _change_config(path, lambda _: DEEP.decode())
+    with pytest.raises(CheckpointError, match="unreadable config"):
+        load_checkpoint(path)
+
+
+def _change_config(path: Path, change: Callable[[str], str]) -> None:
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"]["config"] = change(header["__metadata__"]["config"])
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+
+
+def test_a_video_whose_comment_is_not_text(tmp_path: Path) -> None:
+    path = _seed("video", tmp_path)
+    path.write_bytes(path.read_bytes().replace(b'{"photos"', b'\xff\xfe\xfdhotos"'))
+    assert verify(path).provenance == {}
+    assert len(list(decode(path))) == 4 and frame_rate(path) == 10
+
+
+def test_a_video_without_pictures(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(UikaError, match=r"a\.mp4"):
+        frame_rate(tmp_path / "a.mp4")
+
+
+def test_a_picture_with_a_cut_header(tmp_path: Path) -> None:
+    path = _seed("verify_picture", tmp_path)
+    data = path.read_bytes()
+    path.write_bytes(data[:8] + struct.pack(">I", 5) + data[12:21] + b"\0\0\0\0" + data[21:])
+    with pytest.raises(UikaError, match=r"a\.png"):
+        verify(path)
+
+
+def test_pictures_of_too_many_pixels_are_not_decoded(tmp_path: Path) -> None:
+    path = _seed("verify_picture", tmp_path)
+    data = bytearray(path.read_bytes())
+    data[16:24] = struct.pack(">II", 8000, 8000)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    path.write_bytes(data)
+    with pytest.raises(UikaError, match="are the most"):
+        verify(path)
+
+
+def test_many_large_frames_are_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "a.mp4", torch.rand(30, 96, 128, 3), fps=10)
+    monkeypatch.setattr(importlib.import_module("uika.safeguards.verify"), "_PIXELS_KEPT", 4 * 96 * 128)
+    found = verify(tmp_path / "a.mp4")
+    assert found.watermark is not None and found.watermark.frames <= 4
