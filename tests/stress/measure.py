@@ -20,7 +20,7 @@ Row = dict[str, Any]
 LAST_BIT = 2.0**-23
 PERTURBED = 4  # scenes that differ from the given one by rounding
 FLOOR = 1e-6  # rounding of images that is granted without any perturbation, relative to the brightest
-GRADIENT_FLOOR = 1e-3  # the same of gradients, relative to their norm
+DIGITS, FEW_DIGITS = 1e-4, 1e-3  # the same of gradients, of ordinary and of extreme scenes, relative to their norm
 MARGIN = 1e-4  # relative distance to a threshold within which rounding may decide
 
 
@@ -92,9 +92,13 @@ def _errors(case: Case) -> Row:
 
 
 def ordinary_errors(seed: int) -> Row:
-    """Errors of an ordinary scene."""
+    """Errors of an ordinary scene; where a gradient cancels, also in units of what rounded inputs change."""
     case = ordinary(seed)
-    return _errors(case) | skipped_work(case)
+    row = _errors(case)
+    ratios = {name: error / DIGITS for name, error in row["gradients"].items()}
+    if max(ratios.values()) > 1:
+        ratios = conditioned_errors(case, DIGITS)["gradient_ratios"]
+    return row | {"gradient_ratios": ratios} | skipped_work(case)
 
 
 def gradient_errors(seed: int) -> Row:
@@ -118,12 +122,17 @@ def _oracle(
 
 
 def extreme_errors(seed: int) -> Row:
-    """Errors of an extreme scene, in units of what the last bit of its inputs changes in the oracle.
+    """Errors of an extreme scene."""
+    return conditioned_errors(extreme(seed), FEW_DIGITS)
+
+
+def conditioned_errors(case: Case, floor: float) -> Row:
+    """Errors in units of what the last bit of the inputs changes in the oracle.
 
     Needles a millionth of a pixel wide have no digits to lose: an input that is off by its own rounding moves them by
-    more than their width. A sound computation in float32 stays within a few times that, whatever the scene.
+    more than their width. A sound computation in float32 stays within a few times that, whatever the scene. Of
+    gradients, `floor` times their norm is granted besides.
     """
-    case = extreme(seed)
     leaves = {k: v.clone().requires_grad_() for k, v in case.scene.items()}
     image, alpha, meta = rasterization(**leaves, **case.options, width=case.width, height=case.height)
     order = torch.argsort(meta["depths"], dim=-1, stable=True)
@@ -156,7 +165,7 @@ def extreme_errors(seed: int) -> Row:
         assert got is not None and torch.isfinite(got).all(), name
         off = (got - want).norm()
         errors[name] = float(off / want.norm().clamp_min(1e-12))
-        ratios[name] = float(off / (GRADIENT_FLOOR * want.norm() + moved[name]).clamp_min(1e-12))
+        ratios[name] = float(off / (floor * want.norm() + moved[name]).clamp_min(1e-12))
     shown, hidden = image.detach()[..., :3], ~meta["visible"].any(0)
     return {
         "image": float(error.max()),
