@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from uika.errors import UikaError
-from uika.files import replacing
+from uika.files import write_tensors
 from uika.head import (
     Binding,
     HeadModel,
@@ -90,8 +90,6 @@ class Avatar:
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file; it appears under its name only when it is complete."""
-        from safetensors.torch import save_file
-
         tensors = {name: getattr(self, name).contiguous() for name in _TENSORS}
         metadata = {
             "format": FORMAT,
@@ -99,8 +97,7 @@ class Avatar:
             "head_id": self.head_id,
             "provenance": json.dumps(dict(self.provenance), sort_keys=True),
         }
-        with replacing(path) as temporary:
-            save_file(tensors, temporary, metadata=metadata)
+        write_tensors(path, tensors, metadata)
 
     @staticmethod
     def load(path: str | Path) -> Avatar:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -81,44 +78,3 @@ def test_a_folder_that_cannot_be_written_is_refused_before_work(avatar: Path, tm
         place = tmp_path / "locked" / "x.png"
     code, error = run("render", avatar, "-o", place, "--size", 64, cwd=tmp_path)
     assert code == 2 and error.count("\n") == 1, error
-
-
-COMMANDS = {
-    "animate": ("animate", "{avatar}", "--motion", "orbit", "--fps", "240", "-o", "out/a.mp4", "--size", "128"),
-    "reconstruct": ("reconstruct", "{photo}", "-o", "out/a.safetensors"),
-    "synthesize": ("synthesize", "-o", "out", "--identities", "50", "--size", "64"),
-}
-PHOTO = Path(__file__).resolve().parents[2] / "uika" / "assets" / "portrait.jpg"
-
-
-@pytest.mark.parametrize("name", list(COMMANDS))
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL], ids=["SIGINT", "SIGKILL"])
-def test_stopped_at_a_random_moment(name: str, kind: signal.Signals, avatar: Path, tmp_path: Path) -> None:
-    words = [word.format(avatar=avatar, photo=PHOTO) for word in COMMANDS[name]]
-    rng = random.Random(f"{name}{kind}")
-    for _ in range(2):
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        process = subprocess.Popen(
-            [sys.executable, "-m", "uika", *words],
-            cwd=tmp_path,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=lambda: signal.signal(
-                signal.SIGINT, signal.default_int_handler
-            ),  # a background shell ignores it
-        )
-        time.sleep(rng.uniform(1.0, 8.0))
-        if process.poll() is not None:
-            process.communicate()
-            continue
-        process.send_signal(kind)
-        started = time.monotonic()
-        _, error = process.communicate(timeout=60)
-        assert time.monotonic() - started < 2.0 * max(1, os.getloadavg()[0] / (os.cpu_count() or 1))
-        found = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
-        if kind == signal.SIGINT:
-            assert "Traceback" not in error and error.endswith("interrupted\n"), error
-            assert not [path for path in found if path.name.startswith(".")]
-        whole = [path for path in found if not path.name.startswith(".") and path.suffix in (".mp4", ".safetensors")]
-        assert whole == []

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
+from uika.files import write_tensors
 from uika.model.config import PRESETS, ModelConfig
 from uika.model.reconstructor import Reconstructor
 
@@ -49,7 +47,6 @@ def save_checkpoint(
 
     `dtype` (for example torch.bfloat16) converts the weights on the way; `provenance` is kept in the header.
     """
-    path = Path(path)
     weights = dict(model.named_parameters())
     tensors = {}
     for name, value in model.state_dict().items():
@@ -62,15 +59,7 @@ def save_checkpoint(
         "config": json.dumps(model.config.to_dict()),
         "provenance": json.dumps(dict(provenance or {})),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
-    try:
-        save_file(tensors, temporary, metadata=metadata)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    write_tensors(path, tensors, metadata)
 
 
 def load_checkpoint(path: str | Path) -> Reconstructor:

@@ -17,6 +17,7 @@ import torch.distributed as dist
 import torch.distributed.checkpoint as dcp
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
+from torch.distributed.checkpoint.api import CheckpointException
 
 from uika.errors import UikaError
 from uika.train.config import TrainConfig
@@ -51,14 +52,32 @@ class Checkpoints:
         optimizer: torch.optim.Optimizer,
         mean: RunningMean,
     ) -> Path:
-        """Write a checkpoint; one of that step that is already there is replaced."""
+        """Write a checkpoint; one of that step that is already there is replaced.
+
+        Raises:
+            UikaError: it cannot be written, for example because the disk is full.
+        """
         target = self._folder / f"step-{progress.step:08d}"
         partial = self._folder / f".{target.name}.partial"
+        try:
+            self._write(partial, target, progress, config, _state(network, optimizer, mean))
+        except CheckpointException as error:
+            reason = next(iter(error.failures.values()))[0]
+            raise UikaError(f"{target}: cannot be written ({reason})") from error
+        finally:
+            if self._group.first:
+                shutil.rmtree(partial, ignore_errors=True)
+        self._group.wait()
+        return target
+
+    def _write(
+        self, partial: Path, target: Path, progress: Progress, config: TrainConfig, state: dict[str, Tensor]
+    ) -> None:
         if self._group.first:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
         self._group.wait()
-        state = _state(network, optimizer, mean) | {f"random.{self._group.rank}": torch.get_rng_state()}
+        state |= {f"random.{self._group.rank}": torch.get_rng_state()}
         writer = dcp.HuggingFaceStorageWriter(str(partial), save_distributed=True)
         with _single_process_is_fine():
             dcp.save(state, storage_writer=writer, no_dist=not dist.is_initialized())
@@ -71,8 +90,6 @@ class Checkpoints:
             partial.rename(target)
             for old in self._sorted()[: -self._keep]:
                 shutil.rmtree(old, ignore_errors=True)
-        self._group.wait()
-        return target
 
     def latest(self) -> Path | None:
         """The newest checkpoint whose files are whole; damaged ones are named on stderr and left alone."""

@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from uika._version import __version__
-from uika.files import replacing
+from uika.files import write_tensors
 from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, save_checkpoint
 from uika.model.checkpoint import check_depth
 from uika.model.config import BackboneConfig
@@ -87,8 +86,7 @@ def _save_estimator(path: Path, config: EstimatorConfig, state: dict[str, Tensor
         name: (value if name.endswith(exact) else value.to(torch.bfloat16)).contiguous()
         for name, value in state.items()
     }
-    with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata=header)
+    write_tensors(path, tensors, header)
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
