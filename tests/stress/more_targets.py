@@ -39,7 +39,8 @@ def _read_video(path: Path) -> None:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    smooth = Image.fromarray(np.random.default_rng(0).integers(0, 256, (9, 10, 3), np.uint8)).resize((100, 96))
+    # Too small for a watermark, whose search would take most of the time.
+    smooth = Image.fromarray(np.random.default_rng(0).integers(0, 256, (9, 10, 3), np.uint8)).resize((64, 48))
     made = [folder / name for name in ("a.png", "b.jpg", "c.webp")]
     for path in made:
         smooth.save(path)

@@ -217,13 +217,15 @@ class Rendered(torch.utils.data.Dataset[Tensor]):
         return 4
 
     def __getitem__(self, index: int) -> Tensor:
-        return rasterization(**random_scene(30, 16, 16, seed=index), width=16, height=16)[0][0]
+        # Large enough for several threads, none of which survives a fork.
+        return rasterization(**random_scene(20_000, 256, 256, seed=index), width=256, height=256)[0][0]
 
 
-@pytest.mark.slow
-def test_workers_that_are_spawned_render_the_same() -> None:
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_workers_of_a_loader_render_the_same(start: str) -> None:
     wanted = torch.stack([Rendered()[index] for index in range(4)])
-    loader = DataLoader(Rendered(), batch_size=4, num_workers=1, multiprocessing_context="spawn")
+    loader = DataLoader(Rendered(), batch_size=4, num_workers=1, multiprocessing_context=start, timeout=120)
     assert torch.equal(next(iter(loader)), wanted)
 
 
