@@ -27,9 +27,13 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -q
 
-# Ten thousand random scenes, 200 extreme ones, 100,000 damaged files, stopped commands: hours.
+# Ten thousand random scenes, 200 extreme ones, 100,000 damaged files, stopped commands: hours. Goes on where it was stopped.
 stress: setup
-	UIKA_STRESS=long UIKA_STRESS_TABLE=out/stress.md $(BIN)/python -m pytest -q tests/stress -m "slow or not slow"
+	for name in extreme gradients scenes fuzz; do $(BIN)/python -m tests.stress.campaign $$name || exit 1; done
+	UIKA_STRESS=long UIKA_STRESS_TABLE=out/stress/tests.json $(BIN)/python -m pytest -q -m "slow or not slow" \
+		tests/stress tests/photo/test_read.py tests/train/test_train.py
+	$(BIN)/python -m tests.stress.report
+	$(BIN)/python tools/readme_figures.py
 
 test-all: setup
 	$(BIN)/python -m pytest -q -m "slow or not slow"

@@ -1,7 +1,8 @@
 """Damage files at random and watch their readers: `python -m tests.stress.fuzz --count 10000 [--targets photo ply]`.
 
 A child process reads each damaged file with at most 1 GiB more address space than it had and 10 seconds of its own
-time (or two minutes of the clock); whatever it does besides reading or the documented refusal is a finding, and the file that caused it is kept.
+time (or two minutes of the clock). Whatever it does besides reading or the documented refusal is a finding, and the
+file that caused it is kept.
 """
 
 from __future__ import annotations

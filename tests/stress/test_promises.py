@@ -23,12 +23,11 @@ from uika.exchange import read_json
 from uika.head.unpickle import UnpickleError, read_arrays
 from uika.motion import MotionError
 
-from .conftest import LONG
 from .fuzz import fuzz
 from .targets import TARGETS, captures
 
 ROOT = Path(__file__).resolve().parents[2]
-COUNT = int(os.environ.get("UIKA_FUZZ", 9_000 if LONG else 60))
+COUNT = int(os.environ.get("UIKA_FUZZ", 60))
 # The one unpickler: every name resolves to an inert record, see uika.head.unpickle.
 ALLOWED = {("uika/head/unpickle.py", "pickle.Unpickler")}
 LOADERS = {
