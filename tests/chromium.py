@@ -36,6 +36,7 @@ class Page:
     def __init__(self, socket: Any) -> None:
         self._socket, self._count = socket, 0
         self.problems: list[str] = []
+        self.objects: list[str] = []  # handles of what was logged with errors, for `call_on`
         self.requests: list[str] = []
 
     def call(self, method: str, timeout: float = 120.0, **params: Any) -> dict[str, Any]:
@@ -53,6 +54,7 @@ class Page:
         params, method = message.get("params", {}), message.get("method")
         if method == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
             self.problems.append(" ".join(str(a.get("value", a.get("description"))) for a in params["args"]))
+            self.objects += [a["objectId"] for a in params["args"] if "objectId" in a]
         elif method == "Runtime.exceptionThrown":
             details = params["exceptionDetails"]
             self.problems.append(details.get("exception", {}).get("description", details["text"]))
@@ -70,6 +72,11 @@ class Page:
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 
+    def call_on(self, handle: str, function: str) -> Any:
+        """The value of a JavaScript function called with an object as `this`."""
+        done = self.call("Runtime.callFunctionOn", objectId=handle, functionDeclaration=function, returnByValue=True)
+        return done["result"].get("value")
+
     def wait(self, condition: str, seconds: float = 60.0) -> None:
         deadline = time.monotonic() + seconds
         while not self.run(condition):
@@ -82,6 +89,17 @@ class Page:
     def key(self, name: str, code: int) -> None:
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)
+
+    def press(self, text: str, kind: str = "button") -> None:
+        """Click the first element of a kind that has this text, whether it can be seen or not."""
+        found = f"[...document.querySelectorAll({kind!r})].find((e) => e.innerText.trim() === {text!r})"
+        self.wait(f"!!{found}")
+        self.run(f"{found}.click()")
+
+    def switch(self, text: str) -> None:
+        """Click the control that a label with this text belongs to."""
+        found = f"[...document.querySelectorAll('label')].find((e) => e.innerText.trim() === {text!r})"
+        self.run(f"document.getElementById({found}.htmlFor).click()")
 
     def click(self, x: float, y: float) -> None:
         for kind in ("mousePressed", "mouseReleased"):

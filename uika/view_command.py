@@ -23,11 +23,13 @@ class View:
     motion: str = "talk"
     """orbit, talk, expressions or a motion file, to play."""
     video: Path | None = None
-    """A video to be driven by, instead of a motion."""
+    """A video to be driven by, or the number of a camera (0 is the first) to follow live."""
     count: int | None = None
     """Show at most so many Gaussians."""
     port: int = 8080
     """The port on 127.0.0.1; a higher one if it is taken."""
+    watermark: bool = True
+    """Mark the pictures that the page renders."""
 
     def run(self) -> int:
         """Serve until interrupted."""
@@ -38,20 +40,27 @@ class View:
         from uika.export import thinned
         from uika.head import load_head
         from uika.rendering import check_renderer
-        from uika.viewer import Viewer
+        from uika.viewer import CameraFace, Viewer
 
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
         if self.count is not None:
             avatar = thinned(avatar, self.count)
         check_renderer()
-        if self.video is None:
+        number = self._camera_number()
+        if self.video is None or number is not None:
             motion = get_motion(self.motion, head)
         else:
             from uika.tracking import track_video
 
             motion = track_video(self.video, head, progress=True).motion
-        with Viewer(avatar, head, motion, self.port) as viewer:
+        camera = None if number is None else CameraFace(number, head)
+        with Viewer(avatar, head, motion, self.port, camera=camera, watermark=self.watermark) as viewer:
             print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
             while True:
                 time.sleep(1.0)
+
+    def _camera_number(self) -> int | None:
+        """The camera that `video` names; None if it names a file."""
+        name = "" if self.video is None else str(self.video)
+        return int(name) if name.isdecimal() and not Path(name).exists() else None

@@ -7,20 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from tests.filmed import FPS, GAP, act
 from tests.flame_files import flame_arrays
-from uika.acting import expression_vector, get_motion
+from uika.acting import get_motion
 from uika.cli import main
-from uika.convert.embed import nearest, paint, shade
+from uika.convert.embed import nearest
 from uika.exchange import read_motion
-from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_vertices, rodrigues
+from uika.head import HeadModel, load_head, pose_vertices, rodrigues
 from uika.head.flame import read_flame
 from uika.motion import load_motion
 from uika.tracking import VideoError, track_video
 from uika.transfer import transfer
 from uika.video import write_video
-
-GAP = range(10, 14)
-FPS = 25.0
 
 
 @pytest.fixture(scope="module")
@@ -30,19 +28,9 @@ def head() -> HeadModel:
 
 @pytest.fixture(scope="module")
 def acted(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, torch.Tensor]:
-    """A short video of a painted head that turns and opens its mouth, with a few empty frames; and the turns [T]."""
-    path, count = tmp_path_factory.mktemp("video") / "act.mp4", 24
-    yaw = 0.35 * torch.sin(torch.linspace(0, 4.0, count))
-    colours, camera = paint(head), look_at(0.0, 0.0, 0.9, (0.0, -0.02, 0.0), fov_y=20.0, size=320)
-    frames = []
-    for index in range(count):
-        actions = expression_vector(head, {"jawOpen": 0.5 * float(torch.sin(torch.tensor(index / 4.0)).clamp(min=0))})
-        turn = torch.tensor([0.0, float(yaw[index]), 0.0])
-        vertices = pose_vertices(head, HeadParameters.zeros(head).replace(expression=actions, rotation=turn))
-        picture = torch.from_numpy(shade(vertices, head.faces, colours, camera)[0]).float() / 255
-        frames.append(torch.ones_like(picture) if index in GAP else picture)
-    write_video(path, frames, FPS)
-    return path, yaw
+    """`act` in a file of its own, and the turns [T]."""
+    path = tmp_path_factory.mktemp("video") / "act.mp4"
+    return path, act(head, path)
 
 
 def test_track_command(acted: tuple[Path, torch.Tensor], head: HeadModel, tmp_path: Path, capsys) -> None:

@@ -1,7 +1,8 @@
 """A page on this machine that shows an avatar and moves it live."""
 
+from uika.viewer.camera import CameraFace
 from uika.viewer.controls import Controls
 from uika.viewer.live import LiveSplats
 from uika.viewer.page import Viewer
 
-__all__ = ["Controls", "LiveSplats", "Viewer"]
+__all__ = ["CameraFace", "Controls", "LiveSplats", "Viewer"]

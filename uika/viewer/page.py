@@ -1,13 +1,11 @@
-"""The page: its controls, and the thread that poses what they ask for."""
+"""The page: what it shows, and the thread that poses what its controls ask for."""
 
 from __future__ import annotations
 
 import queue
-import tempfile
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +16,16 @@ from uika.errors import UikaError
 from uika.head import HeadModel, HeadParameters
 from uika.motion import Motion
 from uika.rendering import neutral_camera
-from uika.viewer.controls import Controls, action_groups
+from uika.safeguards import mark
+from uika.video import to_bytes
+from uika.viewer.camera import CameraFace
 from uika.viewer.live import UNITS, LiveSplats
-from uika.viewer.still import compare
+from uika.viewer.panels import IdentityPanel, MotionPanel, PosePanel
+from uika.viewer.sending import KINDS, exported
+from uika.viewer.still import camera_of, compare
 
 _FOV = 20.0  # degrees
 _PRESETS = {"Front": (0.0, 0.0), "Left": (60.0, 0.0), "Right": (-60.0, 0.0), "Above": (0.0, 50.0), "Back": (180.0, 0.0)}
-_IDENTITY_SLIDERS = 8
-_EXPORTS = (".ply", ".splat", ".glb", ".html")
 _STILL = 512  # pixels, the height of a still
 _IDLE = 0.005  # seconds between two looks at the controls
 
@@ -33,14 +33,25 @@ _IDLE = 0.005  # seconds between two looks at the controls
 class Viewer:
     """A running page; close it with `stop`, or use it as a context."""
 
-    def __init__(self, avatar: Avatar, head: HeadModel, motion: Motion | None = None, port: int = 8080) -> None:
+    def __init__(
+        self,
+        avatar: Avatar,
+        head: HeadModel,
+        motion: Motion | None = None,
+        port: int = 8080,
+        *,
+        camera: CameraFace | None = None,
+        watermark: bool = True,
+    ) -> None:
         """Start the server on 127.0.0.1.
 
         Args:
             avatar: the avatar.
             head: the head model that it was made for.
-            motion: a movement to play.
+            motion: a movement to play; None takes the built-in `talk`.
             port: the first port to try.
+            camera: whose face the avatar follows; it is stopped with the page.
+            watermark: whether pictures that the page renders are marked.
 
         Raises:
             AvatarError: the head model is another one.
@@ -50,19 +61,16 @@ class Viewer:
             import viser
         except ModuleNotFoundError as error:
             raise UikaError('the viewer needs viser; run: pip install "uika-drjit[view]"') from error
-        self._head, self._motion = head, motion
+        from uika.acting import get_motion
+
+        self._head, self._camera, self._watermark = head, camera, watermark
+        self._motion = get_motion("talk", head) if motion is None else motion
         self.live = LiveSplats(avatar, head)
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label="avatar", verbose=False)
         self.updates = 0  # poses sent so far
-        self._actions: dict[str, Any] = {}
-        self._pose: dict[str, Any] = {}
-        self._identity: list[Any] = []
         self._mesh: Any = None
-        self._play: Any = None
-        self._scrub: Any = None
-        self._dirty, self._stopped = threading.Event(), threading.Event()
+        self._dirty, self._reshaped, self._stopped = threading.Event(), threading.Event(), threading.Event()
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
-        self._frame, self._began = -1, 0.0
         self._params = HeadParameters.zeros(head)
         self._build()
         self._dirty.set()
@@ -75,9 +83,11 @@ class Viewer:
         return f"http://127.0.0.1:{self.server.get_port()}"
 
     def stop(self) -> None:
-        """End the thread and the server."""
+        """End the threads and the server."""
         self._stopped.set()
         self._thread.join(30)
+        if self._camera is not None:
+            self._camera.stop()
         self.server.stop()
 
     def __enter__(self) -> Viewer:
@@ -89,60 +99,25 @@ class Viewer:
         self.stop()
 
     def _build(self) -> None:
-        scene, gui = self.server.scene, self.server.gui
+        scene, gui, avatar = self.server.scene, self.server.gui, self.live.avatar
         scene.set_up_direction("+y")
         gui.configure_theme(control_layout="fixed", show_share_button=False)
         buffer, _ = self.live.pose(self._params)
-        count = len(self.live.avatar)
+        count = len(avatar)
         centers = buffer[:, :3].copy().view(np.float32)
         white, small = np.ones((count, 3)), np.tile(1e-3 * np.eye(3), (count, 1, 1))
         self._splats = scene.add_gaussian_splats(
             "/avatar", centers=centers, covariances=small, rgbs=white, opacities=white[:, :1]
         )
         self._splats.buffer = buffer
-        camera = neutral_camera(self.live.avatar)
-        self._target = torch.quantile(self.live.avatar.means, torch.tensor([0.002, 0.998]), dim=0).mean(0)
-        self._distance = float((camera.position - self._target).norm())
+        self._target = torch.quantile(avatar.means, torch.tensor([0.002, 0.998]), dim=0).mean(0)
         self.server.on_client_connect(lambda client: self._look(client, 0.0, 0.0))
         self._status = gui.add_markdown(f"{count:,} Gaussians")
         presets = gui.add_button_group("Camera", tuple(_PRESETS))
         presets.on_click(lambda event: self._look(event.client, *_PRESETS[presets.value]))
-        self._build_pose()
-        self._build_motion()
-        self._build_display()
-
-    def _build_pose(self) -> None:
-        gui = self.server.gui
-        ranges = {"turn": 60, "nod": 30, "tilt": 30, "gaze_left": 30, "gaze_down": 20}
-        with gui.add_folder("Pose"):
-            self._pose["jaw"] = self._slider("jaw", 0.0, 1.0)
-            for name, limit in ranges.items():
-                self._pose[name] = self._slider(name, -float(limit), float(limit), 0.5)
-            gui.add_button("Reset").on_click(lambda _: self._reset())
-        for title, names in action_groups(self._head).items():
-            with gui.add_folder(title, expand_by_default=False):
-                for name in names:
-                    self._actions[name] = self._slider(name, 0.0 if title != "Expression" else -3.0, 1.0)
-        with gui.add_folder("Identity", expand_by_default=False):
-            own = self.live.avatar.identity
-            for index in range(min(_IDENTITY_SLIDERS, len(own))):
-                slider = gui.add_slider(f"mode {index + 1}", -3.0, 3.0, 0.05, float(own[index].clamp(-3, 3)))
-                slider.on_update(lambda _: self._jobs.put(self._reshape))
-                self._identity.append(slider)
-
-    def _build_motion(self) -> None:
-        gui = self.server.gui
-        if self._motion is None:
-            return
-        with gui.add_folder("Motion"):
-            self._play = gui.add_checkbox("play", False)
-            self._scrub = gui.add_slider("frame", 0, max(1, len(self._motion) - 1), 1, 0)
-        self._play.on_update(lambda _: self._start())
-        self._scrub.on_update(lambda _: self._dirty.set())
-        self._scrub.on_update(lambda _: setattr(self, "_frame", self._scrub.value))
-
-    def _build_display(self) -> None:
-        gui = self.server.gui
+        self._pose = PosePanel(gui, self._head, self._moved)
+        self._identity = IdentityPanel(gui, avatar.identity, self._reshaped.set)
+        self._playing = MotionPanel(gui, self._motion, self._camera, self._dirty.set)
         with gui.add_folder("Display"):
             colors: Any = gui.add_dropdown("colours", ("photo", "UV"))
             colors.on_update(lambda _: self._jobs.put(lambda: self.live.paint(colors.value)))
@@ -155,22 +130,12 @@ class Viewer:
             self._error = gui.add_image(torch.ones(8, 8, 3).numpy(), label="difference x8", visible=False)
         button.on_click(lambda event: self._render(event.client))
         with gui.add_folder("Export", expand_by_default=False):
-            for kind in _EXPORTS:
+            for kind in KINDS:
                 gui.add_button(kind).on_click(self._sender(kind))
 
-    def _slider(self, name: str, low: float, high: float, step: float = 0.01) -> Any:
-        slider = self.server.gui.add_slider(name.replace("_", " "), low, high, step, 0.0)
-        slider.on_update(lambda _: self._moved())
-        return slider
-
     def _moved(self) -> None:
-        self._frame = -1
+        self._playing.leave()
         self._dirty.set()
-
-    def _reset(self) -> None:
-        for slider in (*self._pose.values(), *self._actions.values()):
-            slider.value = 0.0
-        self._moved()
 
     def _show_mesh(self, shown: bool) -> None:
         if self._mesh is not None:
@@ -182,10 +147,6 @@ class Viewer:
             add = self.server.scene.add_mesh_simple
             self._mesh = add("/mesh", vertices, faces, wireframe=True, color=(40, 40, 40))
 
-    def _start(self) -> None:
-        if self._motion is not None and self._play is not None and self._play.value:
-            self._began = time.perf_counter() - max(0, self._frame) / self._motion.fps
-
     def _look(self, client: Any, yaw: float, pitch: float) -> None:
         camera = neutral_camera(self.live.avatar, yaw, pitch)
         with client.atomic():
@@ -194,44 +155,44 @@ class Viewer:
             client.camera.position = (camera.position * UNITS).numpy()
             client.camera.look_at = (self._target * UNITS).numpy()
 
-    def _reshape(self) -> None:
-        identity = self.live.avatar.identity.clone()
-        values = [slider.value for slider in self._identity]
-        if values == identity[: len(values)].tolist():
-            return  # a later slider's job has done it already
-        identity[: len(values)] = torch.tensor(values)
-        self.live.reshape(identity)
-
     def _work(self) -> None:
         """Everything that poses or renders, in one thread: the newest state of the controls wins."""
         while not self._stopped.is_set():
-            while not self._jobs.empty():
-                self._jobs.get()()
-                self._dirty.set()
-            if self._motion is not None and self._play is not None and self._play.value:
-                place = int((time.perf_counter() - self._began) * self._motion.fps) % len(self._motion)
-                if place != self._frame:
-                    self._scrub.value = place
-                    self._frame = place
-                    self._dirty.set()
-            if not self._dirty.is_set():
-                time.sleep(_IDLE)
-                continue
-            self._dirty.clear()
-            self._params = self._wanted()
-            buffer, vertices = self.live.pose(self._params)
-            self._splats.buffer = buffer
-            if self._mesh is not None:
-                self._mesh.vertices = vertices
-            self.updates += 1
+            try:
+                if not self._step():
+                    time.sleep(_IDLE)
+            except Exception as error:  # the page goes on, and says what it could not do
+                self._status.content = f"**{type(error).__name__}**: {error}"
+
+    def _step(self) -> bool:
+        """Do what is to be done; False if nothing was."""
+        while not self._jobs.empty():
+            self._jobs.get()()
+            self._dirty.set()
+        if self._reshaped.is_set():
+            self._reshaped.clear()
+            self.live.reshape(self._identity.identity())
+            self._dirty.set()
+        camera = self._playing.camera()
+        filmed = None if camera is None else camera.newest()
+        if filmed is not None or self._playing.advance():
+            self._dirty.set()
+        if not self._dirty.is_set():
+            return False
+        self._dirty.clear()
+        self._params = self._wanted() if filmed is None else filmed
+        buffer, vertices = self.live.pose(self._params)
+        self._splats.buffer = buffer
+        if self._mesh is not None:
+            self._mesh.vertices = vertices
+        self.updates += 1
+        return True
 
     def _wanted(self) -> HeadParameters:
-        if self._motion is not None and self._frame >= 0:
-            return self._motion.parameters(self.live.avatar.identity)[min(self._frame, len(self._motion) - 1)]
-        actions = {name: slider.value for name, slider in self._actions.items()}
-        return Controls(**{name: slider.value for name, slider in self._pose.items()}, actions=actions).parameters(
-            self._head
-        )
+        frame = self._playing.frame()
+        if frame >= 0:
+            return self._motion.parameters(self.live.avatar.identity)[frame]
+        return self._pose.controls().parameters(self._head)
 
     def _render(self, client: Any) -> None:
         """Take the browser's picture here, where waiting is allowed, and leave the rest to the working thread."""
@@ -239,35 +200,28 @@ class Viewer:
         camera = client.camera
         view = (camera.wxyz, camera.position, camera.fov)
         width = round(_STILL * camera.aspect)
-        shot = client.get_render(
-            _STILL, width, wxyz=view[0], position=view[1], fov=view[2], transport_format="png", timeout=60.0
-        )
+        try:
+            shot = client.get_render(
+                _STILL, width, wxyz=view[0], position=view[1], fov=view[2], transport_format="png", timeout=60.0
+            )
+        except TimeoutError:
+            self._verdict.content = "the browser sent no picture within 60 s; try again"
+            return
         self._jobs.put(lambda: self._compare(shot, view))
 
     def _compare(self, shot: Any, view: Any) -> None:
         picture, difference, decibels = compare(self.live.avatar, self._head, self._params, shot, view)
-        self._still.image, self._error.image = picture, difference
+        self._still.image = to_bytes(mark(picture) if self._watermark else picture)
+        self._error.image = to_bytes(difference)
         self._still.visible = self._error.visible = True
         self._verdict.content = f"browser against drjit_splat: {decibels:.1f} dB"
 
     def _sender(self, kind: str) -> Callable[[Any], None]:
-        return lambda event: self._jobs.put(lambda: self._send(event, kind))
+        return lambda event: self._jobs.put(lambda: self._send(event.client, kind))
 
-    def _send(self, event: Any, kind: str) -> None:
-        from uika import export
-
-        avatar = self.live.avatar
-        splats = export.posed_splats(avatar, self._head, self._params)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"avatar{kind}"
-            if kind == ".ply":
-                export.write_ply(path, splats.half_turned(), avatar.provenance)
-            elif kind == ".splat":
-                export.write_splat(path, splats.half_turned())
-            elif kind == ".glb":
-                export.write_glb(path, splats, avatar.provenance)
-            else:
-                from uika.acting import get_motion
-
-                export.write_html(path, avatar, self._motion or get_motion("talk", self._head), self._head)
-            event.client.send_file_download(path.name, path.read_bytes())
+    def _send(self, client: Any, kind: str) -> None:
+        camera = client.camera
+        view = (camera.wxyz, camera.position, camera.fov)
+        seen = camera_of(view, round(_STILL * camera.aspect), _STILL)
+        made = exported(kind, self.live.avatar, self._head, self._params, self._motion, seen, self._watermark)
+        client.send_file_download(f"avatar{kind}", made)

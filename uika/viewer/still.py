@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.head import Camera, HeadModel, HeadParameters
@@ -20,7 +21,7 @@ _GAIN = 8.0  # of the difference that is shown
 
 def compare(
     avatar: Avatar, head: HeadModel, params: HeadParameters, shot: NDArray[np.uint8], view: tuple[Any, Any, float]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float]:
+) -> tuple[Tensor, Tensor, float]:
     """Render what the browser shows.
 
     Args:
@@ -32,7 +33,7 @@ def compare(
             vertical field of view in radians.
 
     Returns:
-        The picture [H,W,3], the enlarged absolute difference [H,W,3], and the browser's PSNR in dB.
+        The picture [H,W,3] and the enlarged absolute difference [H,W,3], both in [0,1], and the browser's PSNR in dB.
     """
     height, width = shot.shape[:2]
     browser = torch.from_numpy(shot.copy()).float() / 255
@@ -40,8 +41,7 @@ def compare(
         browser = browser[..., :3] * browser[..., 3:] + 1 - browser[..., 3:]
     picture = render(avatar, params, camera_of(view, width, height), head).rgb.clamp(0, 1)
     difference = ((picture - browser).abs() * _GAIN).clamp(0, 1)
-    as_bytes = [(image * 255).round().byte().numpy() for image in (picture, difference)]
-    return as_bytes[0], as_bytes[1], psnr(browser, picture)
+    return picture, difference, psnr(browser, picture)
 
 
 def camera_of(view: tuple[Any, Any, float], width: int, height: int) -> Camera:

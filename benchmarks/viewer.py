@@ -1,0 +1,136 @@
+"""Updates a second of the viewer: posed and packed, sent, and drawn in a browser.
+
+Run `python -m benchmarks.viewer` with nothing beside it; writes `benchmarks/results/viewer.{json,md}`. The browser is a
+headless Chromium that draws in software on the same cores, so a browser with a graphics card has less to wait for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.rasterizer_common import markdown, save
+from tests.chromium import Page, page
+from uika.acting import get_motion
+from uika.avatar import Avatar
+from uika.commands import PORTRAIT
+from uika.export import thinned
+from uika.head import HeadModel, load_head
+from uika.motion import Motion
+from uika.reconstruction import reconstruct
+from uika.viewer import LiveSplats, Viewer
+
+CASES = ((50_000, (960, 540)), (50_000, (1280, 800)), (20_000, (960, 540)), (10**9, (960, 540)))
+FPS = 60.0  # of the motion: more than is hoped for
+PRESSES = 12
+# Counts the uploads of whole avatars, and the draws that are the first to show one.
+COUNTER = """
+(() => {
+  const seen = window.seen = { uploads: 0, drawn: 0, size: 0, fresh: false, key: 0, waits: [] };
+  const gl = WebGL2RenderingContext.prototype, upload = gl.texSubImage2D, draw = gl.drawElementsInstanced;
+  gl.texSubImage2D = function (...values) {
+    const data = values.find((value) => value instanceof Uint32Array);
+    if (data && data.length > 50000) { seen.uploads++; seen.size = data.length; seen.fresh = true; }
+    return upload.apply(this, values);
+  };
+  gl.drawElementsInstanced = function (...values) {
+    draw.apply(this, values);
+    if (!seen.fresh) return;
+    seen.fresh = false;
+    seen.drawn++;
+    if (seen.key) { seen.waits.push(performance.now() - seen.key); seen.key = 0; }
+  };
+  window.addEventListener("keydown", () => { seen.key = performance.now(); }, true);
+})()
+"""
+
+
+
+def posing(avatar: Avatar, motion: Motion, head: HeadModel, count: int = 100) -> list[float]:
+    """Milliseconds of each pose, packed as the page takes it."""
+    live, params, spans = LiveSplats(avatar, head), motion.parameters(avatar.identity), []
+    for index in range(count):
+        start = time.perf_counter()
+        live.pose(params[index % len(motion)])
+        spans.append(1e3 * (time.perf_counter() - start))
+    return spans[10:]
+
+
+def playing(tab: Page, viewer: Viewer, seconds: float) -> dict[str, float]:
+    """Poses sent and drawn while the motion plays."""
+    tab.switch("play")
+    tab.wait("seen.drawn > 3", 30)
+    drawn, sent, start = tab.run("seen.drawn"), viewer.updates, time.perf_counter()
+    time.sleep(seconds)
+    drawn, sent = tab.run("seen.drawn") - drawn, viewer.updates - sent
+    span = time.perf_counter() - start
+    assert sent, "the motion does not play"
+    tab.switch("play")
+    return {"sent/s": round(sent / span, 1), "drawn/s": round(drawn / span, 1)}
+
+
+def answering(tab: Page) -> list[float]:
+    """Milliseconds from a key press on the jaw slider to the drawing of what it changed."""
+    time.sleep(3.0)
+    tab.run("document.querySelector('[role=slider]').focus()")
+    for press in range(PRESSES):
+        tab.key("ArrowRight", 39)
+        tab.wait(f"seen.waits.length > {press}", 30)
+        time.sleep(0.3)
+    return tab.run("seen.waits")
+
+
+def measure(
+    avatar: Avatar, motion: Motion, head: HeadModel, size: tuple[int, int], seconds: float
+) -> dict[str, object]:
+    """One row of the table."""
+    spans = posing(avatar, motion, head)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Viewer(avatar, head, motion, 8300) as viewer,
+        page(Path(folder), *size) as tab,
+    ):
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source=COUNTER)
+        tab.open(viewer.url)
+        tab.wait("document.querySelectorAll('[role=slider]').length >= 6 && window.seen && seen.drawn > 0")
+        rates, waits = playing(tab, viewer, seconds), answering(tab)
+    row: dict[str, object] = {
+        "Gaussians": len(avatar),
+        "page": f"{size[0]}x{size[1]}",
+        "pose and pack, ms": round(statistics.median(spans), 1),
+        "posed/s": round(1e3 / statistics.median(spans)),
+        **rates,
+        "key to picture, ms": round(statistics.median(waits)),
+        "MB an update": round(len(avatar) * 32 / 1e6, 2),
+    }
+    print(row, flush=True)
+    return row
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure all cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=8.0, help="of playing, for each row")
+    arguments = parser.parse_args(argv)
+    head = load_head()
+    avatar = reconstruct([PORTRAIT], head).avatar
+    motion = get_motion("talk", head, FPS)
+    rows = [measure(thinned(avatar, n), motion, head, size, arguments.seconds) for n, size in CASES]
+    text = "\n".join(
+        (
+            f"The motion asks for {FPS:g} poses a second. Drawn: by headless Chromium in software (SwiftShader) on",
+            "the same cores. Key to picture: median over key presses on the jaw slider.",
+            "",
+            markdown(rows),
+        )
+    )
+    save("viewer", "Viewer", text, {"rows": rows})
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
