@@ -49,7 +49,6 @@ COUNTER = """
 """
 
 
-
 def posing(avatar: Avatar, motion: Motion, head: HeadModel, count: int = 100) -> list[float]:
     """Milliseconds of each pose, packed as the page takes it."""
     live, params, spans = LiveSplats(avatar, head), motion.parameters(avatar.identity), []

@@ -185,7 +185,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("drjit-splat", description="Render 3D Gaussian splats with Dr.Jit.")
+    about = f"Render 3D Gaussian splats with Dr.Jit. {_EXAMPLE}"
+    parser = argparse.ArgumentParser("drjit-splat", description=about)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     render = commands.add_parser("render", help="render a splat .ply file", description=_EXAMPLE)
     render.add_argument("scene", help="a 3DGS .ply file with harmonics of degree 0 to 3")

@@ -1,10 +1,12 @@
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import get_args
 
 import av
 import numpy as np
@@ -16,6 +18,7 @@ from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, load_head
 from uika.cli import main
+from uika.commands import Command
 from uika.head import save_head
 
 
@@ -128,11 +131,18 @@ def test_debug_shows_the_traceback(folder, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "animate", "render", "demo", "doctor"])
-def test_help_has_an_example(capsys, command):
-    assert main([command, "--help"]) == 0
+COMMANDS = [command.__name__.lower() for command in get_args(Command)]
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS, "head import", "head show"])
+def test_help_fits_a_screen_and_has_an_example(capsys, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*command.split(), "--help"]) == 0
     out = capsys.readouterr().out
-    assert f"Example: uika {command}" in out and out.count("\n") < 30
+    assert f"Example: uika {command}" in " ".join(out.split())
+    assert sum(max(1, math.ceil(len(line) / 80)) for line in out.splitlines()) <= 40
+    if not command:
+        assert all(f"\n  {name} " in out for name in COMMANDS)
 
 
 def test_usage_errors_exit_with_2(capsys):

@@ -15,10 +15,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from uika.errors import UikaError, install_command
 
-_ABOUT = (
-    "Photos in, an animatable 3D Gaussian head out. Add --head FILE to any command to use another head model (see "
-    "`uika head import`), and --debug to see the traceback of an error."
-)
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
 
 
@@ -36,6 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in arguments
     try:
         arguments = _choose_head([argument for argument in arguments if argument != "--debug"])
+        if arguments in ([], ["-h"], ["--help"]):
+            return _overview(asked=bool(arguments))
         return _parse(arguments).run()
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -62,15 +60,28 @@ def _choose_head(arguments: list[str]) -> list[str]:
     return arguments[:at] + arguments[at + 2 :]
 
 
+def _overview(asked: bool) -> int:
+    _need_tyro()
+    from uika.commands import Command
+    from uika.overview import overview
+
+    print(overview(Command), file=sys.stdout if asked else sys.stderr)
+    return 0 if asked else _WRONG_INPUT
+
+
 def _parse(arguments: list[str]) -> Any:
+    tyro = _need_tyro()
+    from uika.commands import Command
+
+    return tyro.cli(Command, prog="uika", args=arguments, config=(tyro.conf.OmitArgPrefixes,))
+
+
+def _need_tyro() -> Any:
     try:
         import tyro
     except ModuleNotFoundError as error:
         raise UikaError(f"the command line needs tyro; run: {install_command('tyro')}") from error
-    from uika.commands import Command
-
-    config = (tyro.conf.OmitArgPrefixes,)
-    return tyro.cli(Command, prog="uika", description=_ABOUT, args=arguments, config=config)  # type: ignore[arg-type]
+    return tyro
 
 
 def _explain(error: Exception) -> tuple[int, str]:

@@ -63,7 +63,10 @@ class ShowHead:
 
 @dataclass(frozen=True)
 class Head:
-    """Import a FLAME model, or show what a head model holds."""
+    """Import a FLAME model, or show what a head model holds.
+
+    Example: uika head import flame2023.pkl --obj head_template.obj -o flame.npz
+    """
 
     action: Annotated[ImportHead, subcommand("import")] | Annotated[ShowHead, subcommand("show")]
 

@@ -22,19 +22,19 @@ class Train:
     """
 
     output: Annotated[Path, arg(aliases=["-o"])]
-    """The run's folder: checkpoints, logs and in the end model.safetensors."""
+    """The run's folder, with the model in the end."""
     data: tuple[str, ...] = ("synthetic",)
-    """Folders with captures or shards, or "synthetic" to make people on the way."""
+    """Folders of captures or shards; "synthetic" makes people on the way."""
     preset: Literal["tiny", "base", "paper"] = "tiny"
-    """Size of the network, with the training that suits it."""
+    """Size of the network, and its training."""
     part: Literal["reconstructor", "estimator"] = "reconstructor"
     """Which network."""
     steps: int | None = None
-    """Steps in all; the learning rate ends at 0 there."""
+    """Steps in all."""
     resume: bool = False
     """Go on from the newest whole checkpoint."""
     overfit: int = 0
-    """Self-test: see the same N heads at every step, unchanged."""
+    """Self-test: the same N heads at every step."""
     workers: int = 1
     """Processes that make data; 0 for none."""
     seed: int = 0
@@ -42,11 +42,11 @@ class Train:
     people: int = 1000
     """Number of synthetic people."""
     sharding: Literal["ddp", "fsdp"] = "ddp"
-    """Several processes: each a whole network (ddp), or its parameters cut up among them (fsdp)."""
+    """Copies of the network, or one cut up."""
     device: str = "auto"
     """auto, cpu or cuda."""
     learning_rate: float | None = None
-    """The highest; the preset's own if left out."""
+    """The highest; else the preset's own."""
     images: int | None = None
     """Photos per step and process."""
     size: int | None = None
@@ -54,7 +54,7 @@ class Train:
     save_every: int | None = None
     """Steps from one checkpoint to the next."""
     lpips: Path | None = None
-    """LPIPS weights (.safetensors); without them a loss on gradients takes their place."""
+    """LPIPS weights, else a loss on gradients."""
 
     def run(self) -> int:
         """Train."""

@@ -93,6 +93,12 @@ def test_wrong_input_is_one_sentence(scene: Path, tmp_path: Path, capsys: pytest
         load_camera(tmp_path / "short.json", -1)
 
 
-def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["render", "--help"]) == 0
-    assert "Example: drjit-splat render" in capsys.readouterr().out
+@pytest.mark.parametrize("arguments", [["--help"], ["render", "--help"]])
+def test_help_fits_a_screen_and_has_an_example(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "Example: drjit-splat render" in out
+    assert out.count("\n") <= 40 and max(map(len, out.splitlines())) <= 80

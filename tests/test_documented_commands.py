@@ -1,0 +1,125 @@
+"""Every command that is shown exists with its options; those that end within a minute run, the others are started."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import drjit_splat.cli
+import uika
+from tests.documented import PAGES, ROOT, examples, mentioned, shown
+from tests.filmed import act
+from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
+from uika.cli import _parse, main
+from uika.export import posed_splats, write_ply
+from uika.safeguards import mark, picture_provenance
+
+SHOWN = list(dict.fromkeys(command for page in PAGES for command in shown(page)))
+ALL = list(dict.fromkeys([*SHOWN, *(command for page in PAGES for command in mentioned(page)), *examples()]))
+# What takes minutes or does not end by itself is stopped after so many seconds.
+LONG = {"uika view": 20, "uika train": 60, "uika synthesize": 60, "uika evaluate": 60}
+RUN = [command for command in SHOWN if command.startswith(("uika ", "drjit-splat "))]
+
+
+@pytest.mark.parametrize("command", ALL)
+def test_command_exists(command: str) -> None:
+    program, *rest = shlex.split(command)
+    if program == "uika":
+        assert _understood(rest)
+    elif program == "drjit-splat":
+        drjit_splat.cli._parser().parse_args(rest)
+    elif program == "make":
+        makefile = (ROOT / "Makefile").read_text()
+        assert all(re.search(rf"^{re.escape(target)}:", makefile, re.MULTILINE) for target in rest)
+    elif program == "pip":
+        extras: list[str] = re.findall(r"\[([\w,]+)\]", command)
+        project = (ROOT / "pyproject.toml").read_text()
+        assert all(f"\n{name} = [" in project for found in extras for name in found.split(","))
+    elif "-m" in rest:  # python, torchrun
+        module = rest[rest.index("-m") + 1]
+        assert importlib.util.find_spec(module), f"there is no module {module}"
+        if module == "uika":
+            assert _understood(rest[rest.index("-m") + 2 :])
+    else:
+        script = next(word for word in rest if word.endswith(".py"))
+        assert (ROOT / script).is_file(), f"there is no {script}"
+
+
+def _understood(arguments: list[str]) -> bool:
+    """Whether the command line can be parsed; names alone only have to be those of a command."""
+    if all(word.isalpha() for word in arguments):
+        arguments = [*arguments, "--help"]
+    try:
+        _parse(arguments)
+    except SystemExit as end:
+        return end.code in (0, None)
+    return True
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with everything that the commands take."""
+    place = tmp_path_factory.mktemp("shown")
+    portrait = Path(uika.__file__).parent / "assets" / "portrait.jpg"
+    for name in ("front.jpg", "side.jpg", "me.jpg"):
+        shutil.copy(portrait, place / name)
+    head = load_head()
+    avatar: Avatar = reconstruct([portrait], head, model="none").avatar
+    avatar.save(place / "me.safetensors")
+    rest, camera = HeadParameters.zeros(head), neutral_camera(avatar, size=256)
+    picture = mark(render(avatar, rest, camera, head).rgb)
+    write_video(place / "me.mp4", [picture] * 5, 25.0, picture_provenance(avatar, watermark=True))
+    act(head, place / "act.mp4")
+    (place / "act.mp4").rename(place / "me.mov")
+    write_ply(place / "scene.ply", posed_splats(avatar, head).half_turned())
+    view = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 256, "height": 256}
+    (place / "cameras.json").write_text(json.dumps([view] * 4))
+    return place
+
+
+def _long(command: str) -> bool:
+    return command.startswith(tuple(LONG))
+
+
+@pytest.mark.parametrize("command", [command for command in RUN if not _long(command)])
+def test_command_runs(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    program, *rest = shlex.split(command)
+    assert (main if program == "uika" else drjit_splat.cli.main)(rest) == 0
+    for at, word in enumerate(rest):
+        if word == "-o":
+            assert Path(rest[at + 1]).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [command for command in RUN if _long(command)])
+def test_long_command_starts(command: str, folder: Path) -> None:
+    if "--model " in command:
+        pytest.skip("needs a model that was trained")
+    if "--data held_out" in command and not (folder / "held_out").exists():
+        few = ["--identities", "2", "--views", "3", "--frames", "4", "--size", "128"]
+        assert main(["synthesize", "-o", str(folder / "held_out"), *few]) == 0
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    arguments = [sys.executable, "-m", *shlex.split(command)]
+    if command.startswith("uika synthesize"):
+        arguments[arguments.index("-o") + 1] = "stopped"  # what others read is whole
+    process = subprocess.Popen(
+        arguments, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    deadline = time.monotonic() + next(seconds for start, seconds in LONG.items() if command.startswith(start))
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode in (0, 130) and "Traceback" not in said, said
