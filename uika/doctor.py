@@ -12,7 +12,11 @@ from uika._version import __version__
 from uika.errors import EXTRAS, install_command
 
 _CORE = ("torch", "drjit", "numpy", "safetensors")
-_MODULES = {"pillow": "PIL", "pillow-heif": "pillow_heif"}  # distribution -> import name, where they differ
+_MODULES = {
+    "opencv-contrib-python": "cv2",
+    "pillow": "PIL",
+    "pillow-heif": "pillow_heif",
+}  # distribution -> import name, where they differ
 _DISTRIBUTIONS = {module: name for name, module in _MODULES.items()}
 
 

@@ -16,7 +16,7 @@ class Verify:
     """
 
     file: Positional[Path]
-    """.png, .jpg, .mp4, .safetensors, .glb, .ply or .html."""
+    """.png, .jpg, .mp4, .safetensors, .glb, .ply, .html or .npz."""
 
     def run(self) -> int:
         """Look and print."""

@@ -73,7 +73,7 @@ def test_mark_is_found_where_metadata_is_gone(folder, capsys):
     assert "nothing found" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["e.glb", "e.ply", "e.html"])
+@pytest.mark.parametrize("name", ["e.glb", "e.ply", "e.html", "e.npz"])
 def test_exports_carry_provenance(folder, name):
     assert main(["export", "a.safetensors", "-o", name]) == 0
     assert verify(name).provenance["consent"] == "stated by the user"
@@ -85,7 +85,9 @@ def test_files_that_cannot_be_verified_are_named(folder, capsys):
     (folder / "bad.safetensors").write_bytes(b"{}")
     (folder / "bad.ply").write_bytes(b"{}")
     (folder / "bad.glb").write_bytes(b"glTF")
-    for name in ("none.png", "bad.png", "bad.mp4", "bad.safetensors", "bad.ply", "bad.glb", "small.npz", ".."):
+    (folder / "bad.npz").write_bytes(b"PK")
+    (folder / "a.splat").write_bytes(bytes(32))
+    for name in ("none.png", "bad.png", "bad.mp4", "bad.safetensors", "bad.ply", "bad.glb", "bad.npz", "a.splat", ".."):
         with pytest.raises(UikaError, match="directory" if name == ".." else name):
             verify(folder / name)
         assert main(["verify", name]) == 2

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.arrays import ArraysError, read_npz
 from uika.errors import UikaError
 from uika.safeguards.provenance import as_text
 from uika.safeguards.watermark import Detection, detect
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm")
-DATA = (".safetensors", ".glb", ".ply", ".html")
+DATA = (".safetensors", ".glb", ".ply", ".html", ".npz")
 _FRAMES = 12  # of a video that are looked at
 _MAX_PIXELS = 36_000_000  # a picture of 8K fits
 _PIXELS_KEPT = 64_000_000  # of all frames that are looked at together
@@ -43,7 +44,7 @@ def verify(path: str | Path) -> Finding:
     """Look for provenance and, in pictures and videos, for the watermark.
 
     Args:
-        path: .png, .jpg, .webp, .mp4, .mov, .mkv, .webm, .safetensors, .glb, .ply or .html file.
+        path: .png, .jpg, .webp, .mp4, .mov, .mkv, .webm, .safetensors, .glb, .ply, .html or .npz file.
 
     Raises:
         UikaError: no such file, another kind of file, or one that cannot be read; it names the file.
@@ -127,6 +128,8 @@ def _data(path: Path, kind: str) -> Mapping[str, str]:
         return html_provenance(path)
     if kind == ".ply":
         return _comments(path)
+    if kind == ".npz":
+        return _array(path)
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -134,6 +137,14 @@ def _data(path: Path, kind: str) -> Mapping[str, str]:
             return _parsed((file.metadata() or {}).get(_KEY, ""))
     except SafetensorError as error:
         raise UikaError(f"{path}: is damaged or no safetensors file ({error})") from error
+
+
+def _array(path: Path) -> Mapping[str, str]:
+    try:
+        found = read_npz(path, (_KEY,)).get(_KEY)
+    except ArraysError as error:
+        raise UikaError(f"{path}: is damaged or no .npz file ({error})") from error
+    return {} if found is None else _parsed(str(found))
 
 
 def _comments(path: Path) -> dict[str, str]:
