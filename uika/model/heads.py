@@ -47,7 +47,8 @@ class AttributeHeads(nn.Module):
     """Linear layers `out_layers.{xyz,opacity,scaling,rotation,shs}`, all starting from the values in the config.
 
     Their weights start at zero, so every texel of the untrained model has the same shape: offset exactly 0, rotation
-    the identity, scale exp(init_scale), opacity init_opacity. Only the colour layer reads the observation from the start.
+    the identity, scale exp(init_scale), opacity init_opacity. Only the colour layer reads the observation from the
+    start.
     """
 
     def __init__(self, config: ModelConfig) -> None:
