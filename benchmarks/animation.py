@@ -95,12 +95,12 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
     return row | {"sum": round(sum(least[name] for name in STAGES), 2)}
 
 
-def both_ways(avatar: Avatar, motion: Motion, head: HeadModel) -> list[dict[str, object]]:
+def both_ways(avatar: Avatar, motion: Motion, head: HeadModel, count: int) -> list[dict[str, object]]:
     """The kernels beside the differentiable way through torch, one frame of 512 x 512 each in turn."""
     slow = (to_bytes(frame.rgb) for frame in frames(avatar, motion, head=head))
     fast = film(avatar, motion, head=head)
     found = interleaved({"torch posing (`frames`)": slow.__next__, "kernels (`film`)": fast.__next__}, dict.fromkeys(
-        ("torch posing (`frames`)", "kernels (`film`)"), len(motion) - 4), warm=3)  # fmt: skip
+        ("torch posing (`frames`)", "kernels (`film`)"), count - 4), warm=3)  # fmt: skip
     return [
         {"way": name, "ms least": round(timing.best, 1), "ms median": round(timing.median, 1)}
         for name, timing in found.items()
@@ -152,9 +152,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     sizes, steps = (SIZES[:2], THINNING[::3]) if arguments.quick else (SIZES, THINNING)
     rows = [pace(thinned(avatar, step), motion, head, size, count) for size in sizes for step in steps]
     stages = [split(avatar, motion, head, size, count) for size in sizes]
-    ways = both_ways(avatar, motion, head)
+    ways = both_ways(avatar, motion, head, min(count, 40))
     facts = machine()
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     draw(rows, stages)
     text = (
         f"{facts['processor']}, {facts['cores']} cores, load {facts['load'][0]} at the end: what exceeds the number\n"

@@ -22,13 +22,19 @@ from typing import Any
 SLOWER, WORSE = 1.25, 1.05
 
 # Words of names; what matches none of the lists is an error, of which less is better.
-MACHINE = frozenset({"machine", "load", "floor", "torch", "memory", "fma", "gflops"})  # not ours
-SETTINGS = frozenset({"views", "photos", "splats", "side", "size", "seed", "spp", "threads", "channels", "gaussians"})
-COUNTS = SETTINGS | {"pairs", "frames", "cores", "repeats", "sequences", "faces", "pixels"}
-TIMES = frozenset({"ms", "s", "seconds", "second", "time", "times", "stages", "forward", "backward", "wall", "cpu"}) | {
-    "processor", "latency", "mb", "megabytes", "gb",
+MACHINE = frozenset({"machine", "load", "floor", "torch", "memory", "fma", "gflops", "counters"})  # not ours
+SETTINGS = frozenset({"views", "photos", "splats", "side", "size", "seed", "spp", "threads", "channels"}) | {
+    "gaussians", "setting", "step", "threshold",
 }  # fmt: skip
-RATES = frozenset({"per", "fps", "speedup", "ratio"})  # of speed, more is better
+COUNTS = SETTINGS | {"pairs", "frames", "cores", "repeats", "sequences", "faces", "pixels", "people", "pictures"} | {
+    "unmarked", "steps", "patches",
+}  # fmt: skip
+TIMES = frozenset({"ms", "s", "seconds", "second", "time", "times", "stages", "forward", "backward", "wall", "cpu"}) | {
+    "processor", "latency", "mb", "megabytes", "gb", "mib", "gib", "milliseconds",
+}  # fmt: skip
+RATES = frozenset({"fps", "speedup", "ratio"})  # of speed, more is better; so is what is counted per second
+PER_SECOND = re.compile(r"\bper (processor )?(s|second)\b")
+GAINS = frozenset({"detected", "score"})  # more is better
 SCORES = frozenset({"ssim", "iou", "correlation", "trusted", "csim"})  # at most 1, more is better
 DECIBELS = frozenset({"psnr", "db"})
 MEASURED = TIMES | RATES | SCORES | DECIBELS
@@ -119,7 +125,8 @@ def _print(word: str, change: Change) -> None:
 def _values(content: Any, place: str) -> Iterator[tuple[str, Value]]:
     if isinstance(content, dict):
         for key, value in content.items():
-            yield from _values(value, f"{place}/{key}" if place else str(key))
+            name = str(key).replace("/s", " per s").replace("/", "|")
+            yield from _values(value, f"{place}/{name}" if place else name)
     elif isinstance(content, list):
         for label, item in _labelled(content):
             yield from _values(item, f"{place}[{label}]")
@@ -138,7 +145,7 @@ def _labelled(rows: list[Any]) -> Iterator[tuple[str, Any]]:
         parts = []
         for key, value in row.items() if isinstance(row, dict) else ():
             text = isinstance(value, str) and not _numeric(value)
-            if text or (isinstance(value, Literal) and _words(str(key)) & SETTINGS and value.isdecimal()):
+            if text or (isinstance(value, str) and _words(str(key)) & SETTINGS):
                 parts.append(f"{key}={value}")
         label = " ".join(parts)
         seen[label] = seen.get(label, 0) + 1
@@ -150,8 +157,12 @@ def _numeric(text: str) -> bool:
     return bool(NUMBER.search(text)) and not re.sub(rf"{NUMBER.pattern}|[\s/x%]", "", text)
 
 
+def _text(place: str) -> str:
+    return re.sub(r"[_/|]", " ", re.sub(r"\[.*?\]|#\d+", " ", place).lower())
+
+
 def _words(place: str) -> set[str]:
-    return set(re.sub(r"\[.*?\]|#\d+", " ", place).lower().replace("_", " ").replace("/", " ").split())
+    return set(_text(place).split())
 
 
 def _value(text: str) -> Value:
@@ -162,14 +173,14 @@ def _value(text: str) -> Value:
 
 def _change(place: str, old: Value, new: Value) -> Change:
     words = _words(place)
-    rate = bool(words & RATES)
+    rate = bool(words & RATES or PER_SECOND.search(_text(place)))
 
     def badness(number: float) -> float:
         if words & DECIBELS:
             return 10 ** (-number / 20)
         if words & SCORES:
             return max(1 - number, 0.0)
-        return 1 / number if rate and number > 0 else abs(number)
+        return 1 / number if (rate or words & GAINS) and number > 0 else abs(number)
 
     # JSON drops zeros at the end, so that the finer of the two tells how both were rounded.
     slack = min(old.slack, new.slack)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.figures import lines
+from benchmarks.rasterizer_common import markdown, save
 from uika.correspondence import Fit, LandmarkFit, fit_landmarks, pixel_uv
 from uika.correspondence.detector import unbiased
 from uika.correspondence.refine import refine_landmark_fit
@@ -28,7 +31,6 @@ SIZE, TEXELS = 384, 384
 VIEWS = (1, 2, 4, 8)
 YAW, PITCH = 60.0, 15.0
 NOISE = 1.0  # pixels
-RESULTS = Path(__file__).resolve().parent / "results"
 Table = dict[str, dict[str, list[float]]]  # kind of fit and number of photos -> error -> value of each photo
 
 
@@ -147,7 +149,7 @@ def measure(head: HeadModel, seed: int, refine: bool, detector: bool) -> Table:
     return table
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=int, default=50, help="for the landmark fit")
     parser.add_argument("--refined", type=int, default=12, help="for refinement, which needs Mitsuba's pictures")
@@ -155,7 +157,7 @@ def main() -> None:
         "--detector", action="store_true", help="landmarks of the face mesh detector, not the true ones"
     )
     parser.add_argument("--resume", type=Path, help="folder that keeps each person's figures for a later run")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     head = load_head()
     tables: list[Table] = []
     for seed in range(arguments.people):
@@ -196,17 +198,22 @@ def write(tables: list[Table], arguments: argparse.Namespace) -> None:
     if arguments.detector:
         source = "found by the detector, then freed from its bias on turned faces"
     text = (
-        f"# Fit accuracy\n\nLandmarks: {source}. {arguments.people} people with another expression in each photo, "
+        f"Landmarks: {source}. {arguments.people} people with another expression in each photo, "
         f"yaw within {YAW:g} and pitch within {PITCH:g} degrees, {SIZE} px. "
         f"Refined: {min(arguments.refined, arguments.people)} of them.\n\n"
     )
-    text += "| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]) + "\n"
-    text += "".join("| " + " | ".join(str(value) for value in row.values()) + " |\n" for row in rows)
-    RESULTS.mkdir(exist_ok=True)
     name = "fit_accuracy_detector" if arguments.detector else "fit_accuracy"
-    (RESULTS / f"{name}.json").write_text(json.dumps({"landmarks": source, "rows": rows}, indent=1) + "\n")
-    (RESULTS / f"{name}.md").write_text(text)
-    print(text)
+    save(name, "Fit accuracy", text + markdown(rows), {"landmarks": source, "rows": rows})
+    lines(
+        name,
+        {
+            ("photos", f"{label}, median"): {
+                kind: [(float(str(r["views"])), float(str(r[key]))) for r in rows if r["fit"] == kind]
+                for kind in dict.fromkeys(str(row["fit"]) for row in rows)
+            }
+            for label, key in (("vertices, mm", "vertex median mm"), ("pose, degrees", "pose median deg"))
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.rasterizer_common import RESULTS, machine
 from scenes import compare_splats
 from scenes import render as render_mesh
 from uika.avatar import Avatar
@@ -202,21 +203,27 @@ def _largest_change(first: Avatar, second: Avatar) -> float:
     return max(float((getattr(first, name) - getattr(second, name)).abs().max()) for name in fields)
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("benchmarks/results"))
-    arguments = parser.parse_args()
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS)
+    parser.add_argument("--photos", type=int, nargs="+", default=[1, 2, 4], help="of the known head, up to 4")
+    arguments = parser.parse_args(argv)
     arguments.output.mkdir(parents=True, exist_ok=True)
     head = load_head()
     result = reconstruct([PORTRAIT], head)
     portrait, picture = portrait_figures(result, head)
     mesh = mesh_figures(result.avatar, head)
-    photos = photos_figures(result.avatar, head)
+    photos = photos_figures(result.avatar, head, arguments.photos)
     source = result.photos[0].image.permute(1, 2, 0)
     error = (picture - source).abs().mean(-1, keepdim=True).mul(4).clamp(0, 1).expand(-1, -1, 3)
     strip = (torch.cat((source, picture, error), 1).clamp(0, 1) * 255).round().to(torch.uint8)
     Image.fromarray(strip.numpy()).save(arguments.output / "head_quality.png")
-    figures = {"portrait": asdict(portrait), "mesh": [asdict(f) for f in mesh], "photos": [asdict(f) for f in photos]}
+    figures = {
+        "machine": machine(),
+        "portrait": asdict(portrait),
+        "mesh": [asdict(f) for f in mesh],
+        "photos": [asdict(f) for f in photos],
+    }
     (arguments.output / "head_quality.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
     (arguments.output / "head_quality.md").write_text(table := _markdown(portrait, mesh, photos))
     print(table)

@@ -1,20 +1,23 @@
 """Samples per pixel, time and error of the reference renders against a converged one; memory over many renders.
 
-Run `python -m benchmarks.mitsuba_spp -o out/mitsuba` (minutes; `--reference 256 --renders 50` for a quick look).
+Run `python -m benchmarks.mitsuba_spp` (minutes; `--reference 256 --renders 50` for a quick look); writes
+`benchmarks/results/mitsuba_spp.{json,md,png}`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import scenes
-from benchmarks.chart import line_chart
+from benchmarks.figures import lines
+from benchmarks.rasterizer_common import markdown, save
 from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
@@ -23,36 +26,47 @@ from uika.head import HeadParameters, load_head, look_at, pose_vertices
 SAMPLES = (1, 4, 16, 64, 256)
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/mitsuba"))
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--reference", type=int, default=4096, help="samples per pixel of the reference")
     parser.add_argument("--renders", type=int, default=1000, help="renders of the memory curve")
-    options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
-    result = {"quality": quality(options.size, options.reference), "memory": memory(options.renders)}
-    (options.output / "mitsuba_spp.json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(result, options.renders, options.output)
-    for row in result["quality"]:
-        print("{method:>10} {spp:5d} spp {seconds:8.3f} s {cpu:8.3f} cpu s  rmse {rmse:.5f}".format(**row))
-    print("resident MB:", result["memory"])
+    options = parser.parse_args(argv)
+    rows, resident = quality(options.size, options.reference), memory(options.renders)
+    shown = [
+        {
+            "method": row["method"],
+            "samples per pixel": row["spp"],
+            "wall s": f"{row['seconds']:.3f}",
+            "processor s": f"{row['cpu']:.3f}",
+            "sRGB RMSE": f"{row['rmse']:.5f}",
+        }
+        for row in rows
+    ]
+    text = (
+        f"{options.size} x {options.size} pixels in studio light, against {options.reference} samples, in the mask:\n\n"
+        f"{markdown(shown)}\n\n{options.renders} renders of a moving head hold {min(resident)} to {max(resident)} MB."
+        "\n\n"
+        "![](mitsuba_spp.png)"
+    )
+    save("mitsuba_spp", "Mitsuba: samples, time and error", text, {"quality": rows, "memory MB": resident})
+    draw(rows, resident, options.renders)
 
 
-def draw(result: dict[str, list], renders: int, folder: Path) -> None:
-    """Charts of error over time and of memory over renders."""
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for row in result["quality"]:
-        lines.setdefault(row["method"], []).append((round(row["cpu"], 2), row["rmse"]))
-    (folder / "mitsuba_error.svg").write_text(line_chart(lines, "processor seconds", "sRGB error"))
-    step = max(1, renders // len(result["memory"]))
-    curve = [(step * (k + 1), value) for k, value in enumerate(result["memory"])]
-    (folder / "mitsuba_memory.svg").write_text(
-        line_chart({f"{min(result['memory'])} to {max(result['memory'])} MB": curve}, "renders", "resident")
+def draw(rows: list[dict[str, Any]], resident: list[float], renders: int) -> None:
+    """Error over time, and memory over renders."""
+    errors: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        errors.setdefault(row["method"], []).append((row["cpu"], row["rmse"]))
+    step = max(1, renders // len(resident))
+    curve = [(step * (k + 1), value) for k, value in enumerate(resident)]
+    lines(
+        "mitsuba_spp",
+        {("processor seconds", "sRGB error"): errors, ("renders", "resident MB"): {"64 x 64 pixels": curve}},
     )
 
 
-def quality(size: int, reference_spp: int) -> list[dict[str, object]]:
+def quality(size: int, reference_spp: int) -> list[dict[str, Any]]:
     """Time and sRGB error of each number of samples, studio light, inside the mask."""
     head = load_head()
     person = sample_person(3, head)
@@ -71,7 +85,7 @@ def quality(size: int, reference_spp: int) -> list[dict[str, object]]:
     chunk = min(reference_spp, 512)
     parts = [reference(chunk, 100 + index)["rgb"] for index in range(max(1, reference_spp // chunk))]
     truth, mask = np.mean(parts, 0), reference(64, 0)["mask"] == 1
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
 
     def measure(method: str, spp: int, image: np.ndarray, clock: tuple[float, float]) -> None:
         rmse = float(np.sqrt(np.mean((image - truth)[mask] ** 2)))

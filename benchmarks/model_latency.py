@@ -1,4 +1,4 @@
-"""Time, memory and error of the network: `python -m benchmarks.model_latency --preset tiny --views 1 4 16 -o FOLDER`.
+"""Time, memory and error of the network: `python -m benchmarks.model_latency --preset tiny --views 1 4 16`.
 
 Every configuration runs the same weights on the same views of the bundled portrait's avatar. Weights are random unless
 `--model` names a trained file: speed does not depend on them, errors do. Stages are timed inside one run of the whole;
@@ -8,7 +8,6 @@ processor seconds tell more than wall seconds when the machine is shared.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import platform
@@ -22,8 +21,9 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from benchmarks.chart import line_chart
+from benchmarks.figures import lines
 from benchmarks.model_inputs import Views, make_views
+from benchmarks.rasterizer_common import save
 from uika.head import HeadParameters
 from uika.metrics import psnr
 from uika.model import (
@@ -212,7 +212,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16, 32])
     parser.add_argument("--configurations", nargs="+", default=list(CONFIGURATIONS), choices=CONFIGURATIONS)
     parser.add_argument("--estimator", action="store_true", help="run the correspondence estimator too")
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/model_latency"))
+    parser.add_argument("--name", default="model_latency", help="of the result files")
     arguments = parser.parse_args(argv)
     wanted = [CONFIGURATIONS[0], *(name for name in arguments.configurations if name != CONFIGURATIONS[0])]
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__},", end=" ")
@@ -225,18 +225,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         with torch.no_grad():
             warm()
     rows = []
-    arguments.output.mkdir(parents=True, exist_ok=True)
     for row in run(model, estimator, views, arguments.views, wanted):
         rows.append(row)
         print(table([row]).splitlines()[-1], flush=True)
-        (arguments.output / "figures.json").write_text(json.dumps([asdict(each) for each in rows], indent=1))
     rows.sort(key=lambda row: (row.views, CONFIGURATIONS.index(row.configuration)))
-    text = table(rows)
-    print(text)
-    (arguments.output / "table.md").write_text(text + "\n")
-    lines = {name: [(row.views, row.cpu_s) for row in rows if row.configuration == name] for name in CONFIGURATIONS}
-    chart = line_chart({name: points for name, points in lines.items() if points}, "views", "processor seconds")
-    (arguments.output / "latency.svg").write_text(chart)
+    text = f"`{arguments.model or arguments.preset}`; stages in processor seconds.\n\n{table(rows)}"
+    save(arguments.name, "Network: time, memory and error", text, {"rows": [asdict(row) for row in rows]})
+    curves = {name: [(row.views, row.cpu_s) for row in rows if row.configuration == name] for name in CONFIGURATIONS}
+    lines(arguments.name, {("views", "processor seconds"): {name: line for name, line in curves.items() if line}})
     return 0
 
 

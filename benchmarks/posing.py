@@ -5,11 +5,9 @@ Run `python -m benchmarks.posing`; writes `benchmarks/results/posing.{json,md,pn
 
 from __future__ import annotations
 
-import json
-import os
+import argparse
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import numpy as np
@@ -17,6 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.rasterizer_common import RESULTS, markdown, save
 from uika.acting import expression_vector
 from uika.avatar import Avatar
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
@@ -24,8 +23,6 @@ from uika.head.binding import rigid_turn
 from uika.head.rig import Rig
 from uika.surface import surface_texels
 
-RESULTS = Path(__file__).resolve().parent / "results"
-REPEATS = 60
 COUNT = 130_000
 ATLAS = 416  # texels; a few more than COUNT of them are covered
 
@@ -54,27 +51,27 @@ def textured_avatar(head: HeadModel, size: int) -> tuple[Avatar, np.ndarray]:
     return avatar, texture
 
 
-def fastest(work: Callable[[], object]) -> tuple[float, float]:
+def fastest(work: Callable[[], object], repeats: int) -> tuple[float, float]:
     """Least and median seconds."""
     for _ in range(5):
         work()
     seconds = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         start = time.perf_counter()
         work()
         seconds.append(time.perf_counter() - start)
     return min(seconds), float(np.median(seconds))
 
 
-def bandwidth() -> float:
+def bandwidth(repeats: int) -> float:
     """Bytes per second that a large copy reads and writes."""
     source = torch.zeros(1 << 25)
     target = torch.empty_like(source)
-    least, _ = fastest(lambda: target.copy_(source))
+    least, _ = fastest(lambda: target.copy_(source), repeats)
     return 2 * 4 * len(source) / least
 
 
-def timing(head: HeadModel) -> dict[str, object]:
+def timing(head: HeadModel, repeats: int) -> dict[str, object]:
     binding = uv_texels(head, ATLAS)
     pick = torch.linspace(0, len(binding) - 1, COUNT).long()
     triangle, mix = binding.triangle[pick], binding.barycentric[pick]
@@ -91,12 +88,14 @@ def timing(head: HeadModel) -> dict[str, object]:
         dr.sync_thread()
 
     with torch.no_grad():
-        fused = fastest(kernels)
-        gaussians = fastest(lambda: pose_gaussians(means, quats, scales, canonical, posed, head.faces, triangle, mix))
-        vertices = fastest(lambda: pose_vertices(head, moving))
+        fused = fastest(kernels, repeats)
+        gaussians = fastest(
+            lambda: pose_gaussians(means, quats, scales, canonical, posed, head.faces, triangle, mix), repeats
+        )
+        vertices = fastest(lambda: pose_vertices(head, moving), repeats)
     inputs = 4 * (dr.width(rig.records) + dr.width(rig.rest) + dr.width(rig.corners) + 8 * len(canonical))
     outputs = sum(t.numel() * t.element_size() for t in (means, quats, scales))
-    speed = bandwidth()
+    speed = bandwidth(repeats)
     return {
         "gaussians": COUNT,
         "threads": torch.get_num_threads(),
@@ -108,7 +107,6 @@ def timing(head: HeadModel) -> dict[str, object]:
         "megabytes in and out of the kernels": round((inputs + outputs) / 1e6, 1),
         "memory gigabytes per second": round(speed / 1e9, 1),
         "ms at memory speed": round((inputs + outputs) / speed * 1e3, 2),
-        "load": round(os.getloadavg()[0], 2),
     }
 
 
@@ -140,20 +138,21 @@ def skinning(head: HeadModel) -> tuple[dict[str, object], Image.Image]:
     return figures, Image.fromarray((torch.cat(tiles, 1) * 255).byte().numpy())
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=60)
+    arguments = parser.parse_args(argv)
     torch.set_num_threads(2)
     head = load_head()
-    figures = timing(head)
+    figures = timing(head, arguments.repeats)
     worth, picture = skinning(head)
     figures.update(worth)
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     picture.save(RESULTS / "posing.png")
-    (RESULTS / "posing.json").write_text(json.dumps(figures, indent=1) + "\n")
-    text = "# Posing Gaussians\n\n| figure | value |\n|---|---|\n"
-    text += "".join(f"| {name} | {value} |\n" for name, value in figures.items())
-    text += "\nPicture: Mitsuba; turned with the surface and its error x4; released skinning and its error x4.\n"
-    (RESULTS / "posing.md").write_text(text)
-    print(text)
+    text = markdown([{"figure": name, "value": value} for name, value in figures.items()])
+    text += "\n\nPicture: Mitsuba; turned with the surface and its error x4; released skinning and its error x4."
+    save("posing", "Posing Gaussians", text, {"figures": figures})
 
 
 if __name__ == "__main__":

@@ -8,12 +8,14 @@ float32: they are counted, and left out where the text says "trusted".
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 import torch
 
 from benchmarks import pair_oracle
+from benchmarks.figures import bars
 from benchmarks.rasterizer_common import markdown, save
-from benchmarks.splat_scenes import Scene, head_scene
+from benchmarks.splat_scenes import QUICK, Scene, named_scene
 from drjit_splat import rasterization
 from tests.drjit_splat.common import compare, random_scene
 
@@ -74,14 +76,15 @@ def skipping(scene: Scene) -> dict[str, object]:
     }
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", type=int, default=100, help="number of random small scenes")
-    arguments = parser.parse_args()
-    head, tiny = head_scene(130_000, 512), head_scene(30_000, 256)
-    big = [large(tiny), large(head)]
+    parser.add_argument("--scenes", nargs="+", choices=("30k", "130k", QUICK), default=["30k", "130k"])
+    arguments = parser.parse_args(argv)
+    scenes = [named_scene(name) for name in arguments.scenes]
+    big = [large(scene) for scene in scenes]
     little = small(arguments.small)
-    skipped = [skipping(tiny)]
+    skipped = [skipping(scenes[0])]
     text = "\n\n".join(
         (
             "Head scenes against float64 with the same depth order and skips (gradients: relative L2):",
@@ -93,6 +96,12 @@ def main() -> None:
         )
     )
     save("rasterizer_accuracy", "Rasterizer: accuracy", text, {"large": big, "small": little, "skips": skipped})
+    errors = {
+        str(row["scene"]): {name: float(str(row[name])) for name in ("max", "RMSE", "alpha max", *INPUTS)}
+        for row in big
+    }
+    worst = {key: {str(row["error"]): float(str(row[key])) for row in little} for key in ("median", "worst")}
+    bars("rasterizer_accuracy", {"head": errors, f"{arguments.small} random": worst}, "error against float64", log=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ def machine() -> dict[str, Any]:
         "processor": f"{name} {flags}".strip(),
         "cores": os.cpu_count(),
         "load": [round(v, 2) for v in os.getloadavg()],
-        "drjit": dr.__version__,
+        "drjit": version("drjit"),
         "torch": torch.__version__,
         "drjit_threads": dr.thread_count(),
         "torch_threads": torch.get_num_threads(),

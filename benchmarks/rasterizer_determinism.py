@@ -10,11 +10,13 @@ import argparse
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
 import torch
 
+from benchmarks.figures import bars
 from benchmarks.rasterizer_common import markdown, save
 from benchmarks.splat_scenes import Scene, head_scene
 from drjit_splat import profile, rasterization
@@ -109,19 +111,22 @@ def example(steps: int) -> dict[str, object]:
     return {"steps": steps, "ms a step": round(1e3 * spent / steps, 1), "last error": f"{errors[-1]:.5f}"}
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--changing", type=int, default=200)
-    arguments = parser.parse_args()
-    large, small = head_scene(130_000, 512), head_scene(10_000, 128)
+    parser.add_argument("--quick", action="store_true", help="small scenes and few steps")
+    arguments = parser.parse_args(argv)
+    if arguments.quick:
+        arguments.steps, arguments.changing = 40, 10
+    large, small = head_scene(*((3_000, 96) if arguments.quick else (130_000, 512))), head_scene(10_000, 128)
     weights = [torch.rand(s.size, s.size, 3, generator=torch.Generator().manual_seed(1)) for s in (large, small)]
     rows = repeatability(large, weights[0])
     lasting = endurance(small, weights[1], arguments.changing, arguments.steps)
-    fitted = example(100)
+    fitted = example(10 if arguments.quick else 100)
     text = "\n\n".join(
         (
-            "130k @ 512 x 512, image and gradients against a first run:",
+            f"{len(large.means)} @ {large.size} x {large.size}, image and gradients against a first run:",
             markdown(rows),
             "Up to 10k @ 128 x 128:",
             markdown([lasting]),
@@ -135,6 +140,9 @@ def main() -> None:
         text,
         {"runs": rows, "lasting": lasting, "example": fitted},
     )
+    spreads = {str(row["against the first run"]): float(str(row["gradient spread"])) for row in rows}
+    memory = {name: float(str(value)) for name, value in lasting.items() if name.startswith("MB")}
+    bars("rasterizer_determinism", {"spread of gradients": {"": spreads}, "memory, MB": {"": memory}}, "")
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from benchmarks.figures import bars
 from benchmarks.rasterizer_common import interleaved, markdown, save
 from benchmarks.splat_scenes import Scene, named_scene
 from drjit_splat import Options, prepare, rasterization
@@ -48,12 +49,13 @@ def cases(scene: Scene) -> dict[str, Callable[[], object]]:
     return found
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=12)
     parser.add_argument("--scenes", nargs="+", default=["30k", "130k", "heavy"])
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     rows: dict[str, dict[str, object]] = {}
+    best: dict[str, dict[str, float]] = {}
     counters = []
     for name in arguments.scenes:
         scene = named_scene(name)
@@ -61,6 +63,7 @@ def main() -> None:
         times = interleaved(run, dict.fromkeys(run, arguments.repeats))
         for case, timing in times.items():
             rows.setdefault(case, {"case": case})[name] = timing
+            best.setdefault(name, {})[case] = timing.best
         with torch.no_grad():
             meta = rasterization(*scene.tensors, scene.size, scene.size, options=Options(count_skips=True))[2]
         counters.append({"scene": name, "pairs": meta["n_pairs"][0], **meta["n_culled"][0]})
@@ -71,6 +74,7 @@ def main() -> None:
         + markdown(counters)
     )
     save("rasterizer_skips", "Rasterizer: skips", text, {"times": list(rows.values()), "counters": counters})
+    bars("rasterizer_skips", {name: {"": values} for name, values in best.items()}, "forward + backward, ms")
 
 
 if __name__ == "__main__":

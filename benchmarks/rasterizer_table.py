@@ -9,21 +9,23 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
 from benchmarks import torch_baseline
+from benchmarks.figures import bars
 from benchmarks.rasterizer_common import Timing, fastest_fma, interleaved, markdown, save
-from benchmarks.splat_scenes import NAMES, Scene, named_scene, passes
+from benchmarks.splat_scenes import NAMES, QUICK, Scene, named_scene, passes
 from drjit_splat import profile, rasterization
 
 # Floating point operations of one 4x4 tile and splat: 16 pixels (recurrence 2, clamps 3, transmittance 3, colours 6;
 # backward the same again without the image, and 26 more) and what a pair costs once (4 exponentials, moments).
 FORWARD_FLOP = 16 * 14 + 80
 BACKWARD_FLOP = 16 * (8 + 26) + 200
-BASELINE_TURNS = {"30k": 4, "130k": 3, "500k": 1, "avatar": 2, "heavy": 0}
+PASSES = ("forward", "forward + backward")
+BASELINE_TURNS = {"30k": 4, "130k": 3, "500k": 1, "avatar": 2, "heavy": 0, QUICK: 1}
 
 
 def functions(scene: Scene, baseline: bool) -> dict[str, Callable[[], object]]:
@@ -101,12 +103,27 @@ def measure(name: str, repeats: int, peak: float) -> tuple[dict[str, object], di
     return row, {"scene": name} | stages(run["both"], max(5, repeats // 2))
 
 
-def main() -> None:
+def figure(rows: list[dict[str, object]], stage_rows: list[dict[str, object]]) -> None:
+    """Forward and both passes of either implementation, and the stages."""
+    ours = {name: {str(r["scene"]): float(str(r[name]).split()[0]) for r in rows} for name in PASSES}
+    theirs = {
+        f"torch, {name}": {str(r["scene"]): float(str(r[key])) for r in rows if r[key] != "-"}
+        for name, key in zip(PASSES, ("torch", "torch f + b"), strict=True)
+    }
+    parts = {
+        name: {str(r["scene"]): float(str(r[name])) for r in stage_rows if name in r}
+        for name in stage_rows[0]
+        if name not in ("scene", "records")
+    }
+    bars("rasterizer_table", {"whole": ours | theirs, "stages": parts}, "ms, least", log=True)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--scenes", nargs="+", choices=(*NAMES, QUICK), default=list(NAMES))
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--memory-of", choices=NAMES, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    parser.add_argument("--memory-of", choices=(*NAMES, QUICK), help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
     if arguments.memory_of:
         print_memory(arguments.memory_of)
         return
@@ -126,6 +143,7 @@ def main() -> None:
         + markdown(stage_rows)
     )
     save("rasterizer_table", "Rasterizer: five scenes", text, {"scenes": rows, "stages": stage_rows})
+    figure(rows, stage_rows)
 
 
 if __name__ == "__main__":

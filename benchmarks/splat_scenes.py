@@ -14,6 +14,7 @@ from drjit_splat import rasterization
 
 PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 NAMES = ("30k", "130k", "500k", "avatar", "heavy")
+QUICK = "3k"  # a scene to try a script with
 
 
 @dataclass(frozen=True)
@@ -145,10 +146,10 @@ def passes(scene: Scene) -> dict[str, Callable[[], object]]:
 
 
 def named_scene(name: str) -> Scene:
-    """One of `NAMES`: three sizes of the head, the avatar at 512 x 512, and the heavy tail of 130k @ 512 x 512."""
+    """One of `NAMES`: three sizes of the head, the avatar at 512 x 512, 130k with a heavy tail; or `QUICK`."""
     if name == "avatar":
         return avatar_scene(512)
     if name == "heavy":
         return heavy_scene(130_000, 512)
-    count, size = {"30k": (30_000, 256), "130k": (130_000, 512), "500k": (500_000, 1024)}[name]
+    count, size = {QUICK: (3_000, 96), "30k": (30_000, 256), "130k": (130_000, 512), "500k": (500_000, 1024)}[name]
     return head_scene(count, size)

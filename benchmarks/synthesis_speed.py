@@ -1,22 +1,23 @@
 """Images per second of `uika synthesize`, and where the time goes.
 
-Run `python -m benchmarks.synthesis_speed [-o benchmarks/results]`. Each image is written with mask, correspondences and
-depth, as a file and again in a shard.
+Run `python -m benchmarks.synthesis_speed`; writes `benchmarks/results/synthesis_speed.{json,md,png}`. Each image is
+written with mask, correspondences and depth, as a file and again in a shard.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.figures import bars
+from benchmarks.rasterizer_common import markdown, save
 from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.lighting import sample_lighting
 from scenes.people import paint, sample_person
@@ -30,20 +31,30 @@ from uika.head import HeadParameters, load_head, pose_vertices
 VIEWS = 9
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 512])
     parser.add_argument("--identities", type=int, default=3)
     parser.add_argument("--frames", type=int, default=13)
-    parser.add_argument("-o", "--output", type=Path, help="folder for synthesis_speed.json")
-    options = parser.parse_args()
-    rows = []
+    options = parser.parse_args(argv)
+    rows: list[dict[str, object]] = []
+    spent: dict[str, dict[str, float]] = {}
     for size in options.sizes:
-        row = {"size": size, **throughput(size, options.identities, options.frames), **stages(size, options.frames)}
-        rows.append(row)
-        print(" ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
-    if options.output:
-        (options.output / "synthesis_speed.json").write_text(json.dumps(rows, indent=1) + "\n")
+        found = throughput(size, options.identities, options.frames)
+        spent[f"{size} x {size}"] = stages(size, options.frames)
+        rows.append({"size": size} | {name: f"{value:.3g}" for name, value in found.items()})
+        print(rows[-1], flush=True)
+    parts = [
+        {"stage": name, **{size: f"{values[name]:.3g}" for size, values in spent.items()}}
+        for name in next(iter(spent.values()))
+    ]
+    text = (
+        f"{options.identities} people, {VIEWS} views, {options.frames} frames. Colour and mask at 4 samples a pixel,\n"
+        f"correspondences and depth; PNG files and shards written.\n\n{markdown(rows)}\n\n"
+        f"Processor milliseconds per image of each stage, taken one after the other:\n\n{markdown(parts)}"
+    )
+    save("synthesis_speed", "Making training data", text, {"rows": rows, "stages ms": spent})
+    bars("synthesis_speed", {"stages": spent}, "processor ms per image")
 
 
 def throughput(size: int, identities: int, frames: int) -> dict[str, float]:
@@ -95,12 +106,12 @@ def stages(size: int, frames: int) -> dict[str, float]:
             encode_uv(view.uv)
 
     return {
-        "paint_ms": _cpu(lambda: paint(person, head, texture_size(size))) / (VIEWS * frames),
-        "pose_ms": _cpu(lambda: stage.pose(head, vertices)) / VIEWS,
-        "pose_and_light_ms": _cpu(lambda: Shader(stage, head, vertices, texture, samples=32 if size < 256 else 64))
+        "paint": _cpu(lambda: paint(person, head, texture_size(size))) / (VIEWS * frames),
+        "pose": _cpu(lambda: stage.pose(head, vertices)) / VIEWS,
+        "pose_and_light": _cpu(lambda: Shader(stage, head, vertices, texture, samples=32 if size < 256 else 64))
         / VIEWS,
-        "views_ms": _cpu(lambda: list(shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT))) / VIEWS,
-        "png_ms": _cpu(encode) / VIEWS,
+        "views": _cpu(lambda: list(shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT))) / VIEWS,
+        "png": _cpu(encode) / VIEWS,
     }
 
 

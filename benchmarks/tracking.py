@@ -6,12 +6,12 @@ actions, head pose error, frames per second, and six tracked frames beside the h
 
 from __future__ import annotations
 
-import json
+import argparse
 import math
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 # Small products on two cores: see `uika.cli`. Before numpy is loaded.
@@ -22,6 +22,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.rasterizer_common import RESULTS, markdown, save
+from benchmarks.splat_scenes import PORTRAIT
 from uika.acting import get_motion
 from uika.avatar import Avatar
 from uika.head import HeadModel, load_head, look_at, rodrigues
@@ -32,18 +34,15 @@ from uika.tracking import Track, track_video, video_frames
 from uika.tracking.preview import face_parameters, tracked_camera
 from uika.video import write_video
 
-ROOT = Path(__file__).resolve().parent
-RESULTS = ROOT / "results"
-PORTRAIT = ROOT.parent / "uika" / "assets" / "portrait.jpg"
-FPS, SECONDS, SIZE = 25.0, 10, 512
+FPS, SIZE = 25.0, 512
 STRONGEST = 20
-SHOWN = (20, 62, 104, 146, 188, 230)
+SHOWN = 6
 
 
-def act(head: HeadModel) -> Motion:
+def act(head: HeadModel, seconds: float) -> Motion:
     """The built-in talk and faces, one after the other, on a head that turns, nods, tilts and sways."""
     parts = [get_motion(name, head, FPS).expression for name in ("talk", "expressions")]
-    count = round(FPS * SECONDS)
+    count = round(FPS * seconds)
     expression = torch.cat((*parts, parts[-1][-1:].expand(count, -1)))[:count]
     time_ = torch.arange(count) / FPS
 
@@ -101,8 +100,9 @@ def compare(found: Motion, true: Motion, head: HeadModel) -> dict[str, object]:
 def sheet(found: Track, video: Path, avatar: Avatar, head: HeadModel) -> Image.Image:
     """Six frames above, the avatar that follows them below."""
     canonical, tiles = avatar.canonical_vertices(head), []
+    shown = np.linspace(0.08, 0.92, SHOWN) * len(found.poses)
     for index, frame in enumerate(video_frames(video)):
-        if index in SHOWN:
+        if index in shown.astype(int):
             camera = tracked_camera(found, found.poses[index], SIZE // 2)
             params = face_parameters(found, index, head).replace(identity=avatar.identity)
             with torch.no_grad():
@@ -112,15 +112,17 @@ def sheet(found: Track, video: Path, avatar: Avatar, head: HeadModel) -> Image.I
     return Image.fromarray(np.concatenate(tiles, 1))
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of video")
+    arguments = parser.parse_args(argv)
     head = load_head()
-    motion = act(head)
-    RESULTS.mkdir(exist_ok=True)
+    motion = act(head, arguments.seconds)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / "act.mp4"
         avatar = reconstruct([PORTRAIT], head, model="none").avatar
         film(avatar, motion, head, video)
-        load = os.getloadavg()[0]
         start, processor = time.perf_counter(), time.process_time()
         found = track_video(video, head)
         wall, processor = time.perf_counter() - start, time.process_time() - processor
@@ -132,20 +134,13 @@ def main() -> None:
         "frames per second": round(len(motion) / wall, 1),
         "processor s": round(processor, 1),
         "frames per processor second": round(len(motion) / processor, 1),
-        "load before": round(load, 2),
-        "stages s": {name: round(value, 1) for name, value in found.seconds.items()},
     }
-    text = "# Tracking a video with known motion\n\n| figure | value |\n|---|---|\n"
-    rows = {**figures, **speed}
-    for name in ("correlation", "stages s"):
-        rows.pop(name)
-    text += "".join(f"| {name} | {value} |\n" for name, value in rows.items())
-    text += "\n| action | correlation |\n|---|---|\n"
-    text += "".join(f"| {name} | {value} |\n" for name, value in figures["correlation"].items())  # type: ignore[attr-defined]
-    text += "\nSeconds by stage: " + ", ".join(f"{name} {value}" for name, value in speed["stages s"].items()) + ".\n"  # type: ignore[attr-defined]
-    (RESULTS / "tracking.json").write_text(json.dumps({**figures, **speed}, indent=1) + "\n")
-    (RESULTS / "tracking.md").write_text(text)
-    print(text)
+    rows = [{"figure": key, "value": value} for key, value in {**figures, **speed}.items() if key != "correlation"]
+    actions = [{"action": name, "correlation": value} for name, value in figures["correlation"].items()]
+    seconds = {name: round(value, 1) for name, value in found.seconds.items()}
+    text = f"{markdown(rows)}\n\n{markdown(actions)}\n\nSeconds by stage: "
+    text += ", ".join(f"{name} {value}" for name, value in seconds.items()) + "."
+    save("tracking", "Tracking a video with known motion", text, {**figures, **speed, "stages s": seconds})
 
 
 if __name__ == "__main__":

@@ -1,17 +1,18 @@
 """How surely the watermark is found, how often it is seen where it is not, and what it costs.
 
-Run: python -m benchmarks.watermark AVATAR.safetensors
+Run `python -m benchmarks.watermark`; writes `benchmarks/results/watermark.{json,md,png}`.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
-import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -19,14 +20,17 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.figures import bars
+from benchmarks.rasterizer_common import markdown, save
+from benchmarks.splat_scenes import PORTRAIT
 from uika import Avatar, get_motion, load_head
 from uika.filming import film
 from uika.metrics import psnr
+from uika.reconstruction import reconstruct
 from uika.safeguards import detect, mark
 from uika.safeguards.watermark import THRESHOLD
 
 Picture = NDArray[np.uint8]
-RESULTS = Path(__file__).parent / "results"
 RATES = {"MP4, CRF 18 (default)": "18", "MP4, CRF 28": "28"}
 
 
@@ -90,16 +94,18 @@ def summary(name: str, marked: list[float], plain: list[float] | None = None) ->
     return row
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("avatar", type=Path)
+    parser.add_argument("--avatar", type=Path, help="an avatar file; by default one made from the bundled portrait")
     parser.add_argument("--pictures", type=int, default=24, help="for each handling")
     parser.add_argument("--unmarked", type=int, default=200, help="pictures to look for false alarms in")
-    arguments = parser.parse_args()
-    head, avatar = load_head(), Avatar.load(arguments.avatar)
+    arguments = parser.parse_args(argv)
+    head = load_head()
+    avatar = Avatar.load(arguments.avatar) if arguments.avatar else reconstruct([PORTRAIT], head).avatar
     plain: list[Picture] = []
     for name in ("talk", "orbit", "expressions"):
-        plain += [picture.copy() for picture in film(avatar, get_motion(name, head), head=head)]
+        some = islice(film(avatar, get_motion(name, head), head=head), arguments.unmarked)
+        plain += [picture.copy() for picture in some]
     plain = [plain[index] for index in np.linspace(0, len(plain) - 1, arguments.unmarked).round().astype(int)]
     marked = [mark(picture) for picture in plain]
     cost = [
@@ -119,17 +125,23 @@ def main() -> None:
             rows.append(summary(f"{name}, single frames", scores(decoded[::6])))
             together = detect([torch.from_numpy(p.copy()).float() / 255 for p in decoded[::6]]).score
             rows.append(summary(f"{name}, frames together", [together]) | {"bytes": size, "bytes unmarked": before})
-    result = {
+    result: dict[str, Any] = {
         "threshold": THRESHOLD,
         "PSNR of rendered frames, dB": {"mean": round(float(np.mean(cost)), 2), "least": round(min(cost), 2)},
         "PSNR of a grey picture, dB": round(grey_cost, 2),
         "milliseconds for a 512x512 frame": round(milliseconds, 2),
         "rows": rows,
     }
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "watermark.json").write_text(json.dumps(result, indent=1) + "\n")
-    (RESULTS / "watermark.md").write_text(_table(result))
-    print(_table(result))
+    save("watermark", "Watermark", _text(result), result)
+    bars(
+        "watermark",
+        {"least score of the marked": {"": {str(r["handling"]): _number(r["lowest score"]) for r in rows}}},
+        f"score; found from {THRESHOLD}",
+    )
+
+
+def _number(value: object) -> float:
+    return float(str(value))
 
 
 def _timed(picture: Picture) -> float:
@@ -138,14 +150,10 @@ def _timed(picture: Picture) -> float:
     return time.perf_counter() - start
 
 
-def _table(result: dict[str, object]) -> str:
-    rows = result["rows"]
-    assert isinstance(rows, list)
-    lines = [f"{key}: {value}\n" for key, value in result.items() if key != "rows"]
-    names = list(dict.fromkeys(key for row in rows for key in row))
-    lines += ["", "| " + " | ".join(names) + " |", "|" + " --- |" * len(names)]
-    lines += ["| " + " | ".join(str(row.get(name, "")) for name in names) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+def _text(result: dict[str, Any]) -> str:
+    names = list(dict.fromkeys(key for row in result["rows"] for key in row))
+    rows = [{name: row.get(name, "") for name in names} for row in result["rows"]]
+    return "\n".join(f"{key}: {value}\n" for key, value in result.items() if key != "rows") + "\n" + markdown(rows)
 
 
 if __name__ == "__main__":

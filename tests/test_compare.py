@@ -14,6 +14,8 @@ FIGURES: dict[str, Any] = {
     ],
     "fit": {"vertex mm": 0.78, "psnr": 30.85, "mask_iou": 0.95},
     "frames per second": 60.0,
+    "film": {"frames/s": 60, "cpu_ms_per_image": 40, "lowest score": 8, "patches": 7},
+    "thresholds": [{"setting": "1e-2", "f + b ms": "20.0"}, {"setting": "1/255", "f + b ms": "30.0"}],
 }
 
 
@@ -49,6 +51,10 @@ def test_equal_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         (changed("fit", "mask_iou", to=0.9), "less accurate x2.00: fit/mask_iou"),
         (changed("frames per second", to=30.0), "slower x2.00: frames per second"),
         (changed("scenes", 1, "speedup", to="10x"), "slower x5.10: scenes[scene=130k side=512]/speedup"),
+        (changed("film", "frames/s", to=30), "slower x2.00: film/frames per s: 60 -> 30"),
+        (changed("film", "cpu_ms_per_image", to=80), "slower x2.00: film/cpu_ms_per_image: 40 -> 80"),
+        (changed("film", "lowest score", to=4), "less accurate x2.00: film/lowest score: 8 -> 4"),
+        (changed("thresholds", 0, "f + b ms", to="40.0"), "slower x2.00: thresholds[setting=1e-2]/f + b ms: 20 -> 40"),
     ],
 )
 def test_what_got_worse_is_named(
@@ -76,11 +82,12 @@ def test_gains_pass(figures: dict[str, Any], tmp_path: Path, capsys: pytest.Capt
     "figures",
     [
         changed("scenes", 0, "pairs", to=5000),
+        changed("film", "patches", to=70),
         changed("machine", "load", to=[9.9]),
         changed("scenes", to=FIGURES["scenes"][::-1]),
         changed("fit", "vertex mm", to=0.8),
     ],
-    ids=["count", "machine", "order of rows", "within the limit"],
+    ids=["count", "another count", "machine", "order of rows", "within the limit"],
 )
 def test_what_is_no_loss_passes(figures: dict[str, Any], tmp_path: Path) -> None:
     assert run(tmp_path, figures) == 0

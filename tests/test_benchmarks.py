@@ -1,0 +1,49 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import benchmarks.__main__ as runner
+from benchmarks import compare
+
+FOLDER = Path(runner.__file__).parent
+BY_HAND = {"ablations", "learned", "training", "viewer"}  # they need people to train on, or a browser
+
+
+def test_every_script_that_writes_figures_is_run() -> None:
+    writers = {path.stem for path in FOLDER.glob("[a-z]*.py") if "def main(" in path.read_text()} - {"compare"}
+    assert writers - BY_HAND == set(runner.SCRIPTS)
+
+
+@pytest.mark.parametrize("path", sorted((FOLDER / "results").glob("*.json")), ids=lambda path: path.stem)
+def test_every_result_can_be_compared(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare.main([str(path), str(path)]) == 0
+    assert "0 worse, 0 better, 0 gone" in capsys.readouterr().out
+
+
+def test_a_script_that_writes_nothing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BENCHMARK_RESULTS", str(tmp_path))
+    monkeypatch.setattr(runner, "SCRIPTS", {"compare": ()})
+    monkeypatch.setattr(runner, "QUICK_RESULTS", tmp_path)
+
+    def silent(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", silent)
+    with pytest.raises(SystemExit, match=r"did not write compare.json, compare.md, compare.png"):
+        runner.run("compare", quick=True)
+
+
+def test_names_are_checked(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        runner.main(["nonsense"])
+    assert "no benchmark is called nonsense" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_quick_run_writes_everything(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "--quick", "rasterizer_skips"], capture_output=True, text=True, check=True
+    )
+    assert "rasterizer_skips ..." in done.stdout
