@@ -3,8 +3,8 @@
 Each runs in a process of its own and writes NAME.json, NAME.md and NAME.png with the machine described; one that does
 not is an error. With `--quick` all run on next to nothing and write to out/bench-quick: that shows that they run, and
 says nothing about speed. Without it, run them with nothing else on the machine. `python -m benchmarks.compare OLD NEW`
-says what changed between two JSON files. Benchmarks of training and of trained weights need people to train on and are
-started by hand (`benchmarks.training`, `benchmarks.learned`, `benchmarks.ablations`).
+says what changed between two JSON files. What needs people to train on (`benchmarks.training`, `benchmarks.learned`,
+`benchmarks.ablations`) or a browser (`benchmarks.viewer`, `benchmarks.export`) is started by hand.
 """
 
 from __future__ import annotations

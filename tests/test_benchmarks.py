@@ -8,7 +8,7 @@ import benchmarks.__main__ as runner
 from benchmarks import compare
 
 FOLDER = Path(runner.__file__).parent
-BY_HAND = {"ablations", "learned", "training", "viewer"}  # they need people to train on, or a browser
+BY_HAND = {"ablations", "learned", "training", "export", "viewer"}  # they need people to train on, or a browser
 
 
 def test_every_script_that_writes_figures_is_run() -> None:
