@@ -39,8 +39,11 @@ def worst(first: Any, second: Any) -> float:
 def test_occupied_cells() -> None:
     maps = torch.zeros(2, 1, 8, 8)
     maps[0, 0, 3, 4] = 1e-3
+    maps[1, 0, :2, :2] = torch.tensor([[1.0, 0.5], [0.0, 0.0]])
     cells = occupied(maps, (2, 4))
-    assert cells.tolist() == [[False, False, True, False] + [False] * 4, [False] * 8]
+    assert cells.tolist() == [[False, False, True, False] + [False] * 4, [True] + [False] * 7]
+    assert occupied(maps, (2, 4), 1.5 / 8).nonzero().tolist() == []
+    assert occupied(maps, (2, 4), 1.4 / 8).nonzero().tolist() == [[1, 0]]
 
 
 def test_covered_tokens() -> None:
@@ -69,6 +72,15 @@ def test_foreground_skips_what_is_empty_and_stays_close(model: Reconstructor, ma
     assert 0 < kept.report["skipped_patches"] < kept.report["patches"] == 3 * 32
     assert 0 < kept.report["skipped_tokens"] < kept.report["tokens"] == 64
     assert 0 < worst(dense, kept) < 0.02
+
+
+def test_patches_at_the_edge_count_above_an_eighth(model: Reconstructor, make_inputs: Make) -> None:
+    inputs = make_inputs(1, side=64)
+    for columns, kept in ((0, 8), (2, 8), (3, 12)):  # of the 16 in each patch of the second column
+        inputs["masks"][:] = 0
+        inputs["masks"][..., 32 - columns :] = 1
+        views = model.encode(inputs["images"], inputs["masks"], inputs["pixel_uv"], keep="foreground")
+        assert len(views[0][0].screen) == kept
 
 
 def test_foreground_ignores_the_background(model: Reconstructor, make_inputs: Make) -> None:

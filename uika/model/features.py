@@ -25,9 +25,13 @@ class ViewFeatures(NamedTuple):
     patches: int  # patches of both images, of which L + M are kept
 
 
-def occupied(maps: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Which cells [N,h*w] of a grid (h, w) hold a positive value of maps [N,1,H,W]."""
-    return (functional.adaptive_max_pool2d(maps.float(), grid) > 0).flatten(1)
+# Share of its area up to which a patch counts as empty: what little it shows, its neighbours tell as well.
+EMPTY = 1 / 8
+
+
+def occupied(maps: Tensor, grid: tuple[int, int], share: float = 0.0) -> Tensor:
+    """Which cells [N,h*w] of a grid (h, w) are filled to more than `share` by maps [N,1,H,W] of values in [0,1]."""
+    return (functional.adaptive_avg_pool2d(maps.float(), grid) > share).flatten(1)
 
 
 def covered_tokens(texel: Tensor, map_size: int, grid: int) -> Tensor:

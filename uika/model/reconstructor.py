@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from uika.model.config import ModelConfig
 from uika.model.dpt import UvDpt, resize
-from uika.model.features import FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
+from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
 from uika.model.heads import AttributeHeads, Attributes, TexelMlp
@@ -88,8 +88,9 @@ class Reconstructor(nn.Module):
                       (uv.grid "corners") counts every pixel once and takes no notice of it
         texel         [M] int64 row-major indices of the valid texels of the S*S atlas (S = config.map_size)
         surface       the canonical surface at those texels
-        keep          "all" patches and tokens, or the "foreground": patches with nothing of the mask, patches of
-                      reprojected images without a pixel and tokens outside the atlas are left out, an approximation
+        keep          "all" patches and tokens, or the "foreground", an approximation: left out are patches of photos
+                      and of reprojected images of which less than an eighth shows the head, and tokens outside the
+                      atlas
         cache         features of photos seen before, so that only new ones are encoded; results are the same
 
         The report counts `views`, `empty_views` (no pixel reached the atlas), `texels`, `empty_texels` (valid texels
@@ -207,7 +208,7 @@ class Reconstructor(nn.Module):
         """Tokens of photos [N,1,3,H,W]."""
         size = self.view_size(images)
         patch = self.config.backbone.patch_size
-        kept = None if keep == "all" else occupied(masks[:, 0], (size[0] // patch, size[1] // patch))
+        kept = None if keep == "all" else occupied(masks[:, 0], (size[0] // patch, size[1] // patch), EMPTY)
         with arithmetic(self.precision, images.device):
             return self.encoder.screen(resize(images[:, 0], size, antialias=True), kept)
 
@@ -220,7 +221,7 @@ class Reconstructor(nn.Module):
         sums, finer = accumulate_sizes(images, uv, masks, sizes, config.grid, weights, oversample=config.oversample)
         views, hits = view_images(finer, config.close_radius)
         grid = side // self.config.backbone.patch_size
-        kept = None if keep == "all" else occupied(hits[:, 0], (grid, grid))
+        kept = None if keep == "all" else occupied(hits[:, 0] > 0, (grid, grid), EMPTY)
         with arithmetic(self.precision, images.device):
             tokens = self.encoder.uv(views[:, 0], kept)
         rows = [None] * len(images) if tokens is None else tokens

@@ -45,17 +45,18 @@ def reproject(
 
 def view_images(sums: Sums, close_radius: int = 0) -> tuple[Tensor, Tensor]:
     """The result of `reproject` from the sums of `accumulate`."""
-    batch, views = sums.weight.shape[:2]
-    colors = mean_color(sums.color, sums.weight).flatten(0, 1).float()
-    weight = sums.weight.flatten(0, 1).float()
-    if close_radius > 0:
-        colors, weight = close_holes(colors, weight, radius=close_radius)
-    return colors.unflatten(0, (batch, views)), weight.unflatten(0, (batch, views))
+    results = []
+    # One by one, so that the steps find a view in the processor's cache.
+    for color, weight in zip(sums.color.flatten(0, 1), sums.weight.flatten(0, 1), strict=True):
+        image, hits = mean_color(color, weight)[None].float(), weight[None].float()
+        results.append(close_holes(image, hits, radius=close_radius) if close_radius > 0 else (image, hits))
+    images, weights = (torch.cat(parts).unflatten(0, sums.weight.shape[:2]) for parts in zip(*results, strict=True))
+    return images, weights
 
 
 def mean_color(color: Tensor, weight: Tensor) -> Tensor:
-    """Sums [...,3,S,S] over weights [...,1,S,S]; exactly 0 where the weight is 0."""
-    return torch.where(weight > 0, color / weight.clamp_min(1e-300), torch.zeros_like(color))
+    """Sums [...,3,S,S] over weights [...,1,S,S]; exactly 0 where the weight is 0, as the sums are there."""
+    return color / weight.clamp_min(1e-300)
 
 
 def accumulate(
@@ -104,14 +105,13 @@ def accumulate_sizes(
         item, index = divmod(view, views)
         trust = None if weights is None else weights[item, index]
         table = _table(images[item, index], uv[item, index], masks[item, index], grid, trust)
+        table[2:] /= oversample**2
         scratch = torch.empty(table[2:].numel(), dtype=torch.float64, device=table.device)
         for sample in _samples(table, oversample):
             payload = scratch[: sample[2:].numel()].view(5, -1).copy_(sample[2:].flatten(1))
             for size, total in zip(sizes, totals, strict=True):
                 total[view].scatter_add_(1, _cells(sample[:2], size, grid).expand(5, -1), payload)
-    maps = [
-        total.div_(oversample**2).view(batch, views, 5, size, size) for size, total in zip(sizes, totals, strict=True)
-    ]
+    maps = [total.view(batch, views, 5, size, size) for size, total in zip(sizes, totals, strict=True)]
     return [Sums(color=parts[:, :, :3], weight=parts[:, :, 3:4], samples=parts[:, :, 4:5]) for parts in maps]
 
 
