@@ -53,6 +53,8 @@ class Train:
     """Side of photos and pictures in pixels."""
     save_every: int | None = None
     """Steps from one checkpoint to the next."""
+    init: Path | None = None
+    """A trained model of the same architecture to start from."""
     lpips: Path | None = None
     """LPIPS weights, else a loss on gradients."""
 
@@ -91,9 +93,7 @@ class Train:
             people = Stored([Path(name) for name in self.data])
         group = join_group(self.device)
         try:
-            setup = Setup(
-                self.output, self.workers, self.resume, self.overfit, self.sharding, self.lpips, progress=True
-            )
+            setup = Setup(self.output, self.workers, self.resume, self.overfit, self.sharding, self.lpips, self.init)
             train(config, people, setup, group)
         finally:
             leave_group()

@@ -9,9 +9,9 @@ from tests.train.common import CONFIG, SIZE, PaintedPeople, PaintedPerson
 from uika.head import load_head, look_at, pose_vertices, project
 from uika.head.parameters import HeadParameters
 from uika.train import Draw, ItemMaker
+from uika.train.align import aligned_camera
 from uika.train.augment import degrade, draw_grade
 from uika.train.crops import View
-from uika.train.items import aligned_camera
 
 AUGMENTED = replace(CONFIG, augment=True)
 

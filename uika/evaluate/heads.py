@@ -20,8 +20,8 @@ from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files
 from uika.rendering import render
+from uika.train.align import aligned_camera
 from uika.train.crops import View
-from uika.train.items import aligned_camera
 from uika.video import to_bytes
 
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any

@@ -28,6 +28,7 @@ class LossWeights:
     entropy: float = 0.0
     alpha: float = 0.1
     atlas: float = 0.0  # of colours against the true ones of the atlas, where data with exact correspondence has them
+    relief: float = 0.0  # of positions in metres against the true surface
     variation: float = 0.001  # of the estimator's maps
 
 
@@ -116,13 +117,13 @@ TRAINING: dict[str, TrainConfig] = {
         targets=1,
         images=3,
         items=3,
-        fitted=0.35,
+        fitted=0.5,
         texels=192,
         atlas_views=4,
         learning_rate=2e-3,
         warmup=50,
         precision="float32",
-        losses=LossWeights(alpha=0.3, atlas=1.0),
+        losses=LossWeights(alpha=0.3, atlas=1.0, relief=5.0),
     ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
     # The paper's recipe: no running mean, losses as printed.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from uika._version import __version__
 from uika.files import write_tensors
-from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, save_checkpoint
+from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, load_checkpoint, save_checkpoint
 from uika.model.checkpoint import check_depth
 from uika.model.config import BackboneConfig
 from uika.train.checkpoint import Progress
@@ -47,6 +47,19 @@ def export(path: Path, task: Task, mean: RunningMean, config: TrainConfig, progr
         save_checkpoint(path, copy, torch.bfloat16, provenance)
     elif isinstance(task.model, Estimator):
         _save_estimator(path, task.model.config, state, provenance)
+
+
+def load_start(task: Task, path: Path) -> None:
+    """Give a task's network the weights of a model file.
+
+    Raises:
+        CheckpointError: the file cannot be read, or is of another architecture.
+    """
+    stored = load_checkpoint(path) if isinstance(task.model, Reconstructor) else load_estimator(path)
+    try:
+        task.model.load_state_dict(stored.state_dict())
+    except RuntimeError as error:
+        raise CheckpointError(f"{path}: is a model of another architecture than the training's") from error
 
 
 def load_estimator(path: str | Path) -> Estimator:

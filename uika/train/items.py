@@ -13,6 +13,8 @@ from uika.correspondence import Fit, fit_photos, pixel_uv
 from uika.data import DataError
 from uika.feeding import model_inputs
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
+from uika.surface import surface_texels
+from uika.train.align import align, aligned_camera
 from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
 from uika.train.crops import View
@@ -51,6 +53,7 @@ class Item:
     coverage: Tensor  # [D,1,S,S]
     backgrounds: Tensor  # [D,3]
     texture: Tensor  # [4,A,A] true colours of the atlas and where they are known; empty if nowhere
+    relief: Tensor  # [M,3] where the true surface lies, in the frame of `points`
 
     def to(self, device: torch.device) -> Item:
         """A copy on another device."""
@@ -109,7 +112,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         keys = tuple(view.key for view in (*photos, *pictures))
         none = torch.zeros(0)
         if config.part == "estimator":
-            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 12)
+            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 13)
         fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
         uv, valid, weight = pixel_uv(fit, head, masks)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -141,6 +144,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             coverage=torch.stack([view.mask for view in pictures])[:, None],
             backgrounds=backgrounds.contiguous(),
             texture=texture,
+            relief=_relief(photos[0], head, fit, config.model.map_size) if fitted else surface.points[0],
         )
 
 
@@ -225,6 +229,17 @@ def _smooth_noise(head: HeadModel, random: np.random.Generator) -> Tensor:
     return torch.cos(place @ waves.mT + phases) @ mixture * (2 / 4) ** 0.5
 
 
+def _relief(view: View, head: HeadModel, fit: Fit, size: int) -> Tensor:
+    """The true canonical surface [M,3] at the texels, moved and scaled to where a fit has the face."""
+    identity, offset = _parameters(view).identity, _offset(view, head)
+    zero = HeadParameters.zeros(head)
+    truth = shaped_vertices(head, zero.replace(identity=identity), offset)
+    own = shaped_vertices(head, zero.replace(identity=fit.parameters.identity[0]), fit.static_offset)
+    scale, rotation, shift = align(truth, own, head.masks["face"])
+    points = surface_texels(head, identity, offset, size)[0].points[0].double()
+    return (scale * points @ rotation.mT + shift).float()
+
+
 def _poses(pictures: list[View], head: HeadModel, fit: Fit | None) -> tuple[Tensor, Camera]:
     """Posed vertices [D,N,3] and cameras [D] of the pictures; a fitted head is put where the true one is."""
     posed, cameras = [], []
@@ -238,27 +253,6 @@ def _poses(pictures: list[View], head: HeadModel, fit: Fit | None) -> tuple[Tens
         posed.append(vertices)
         cameras.append(camera)
     return torch.stack(posed), Camera.stack(cameras)
-
-
-def aligned_camera(points: Tensor, target: Tensor, weight: Tensor, camera: Camera) -> Camera:
-    """The camera that sees `points` [N,3] as `camera` sees `target` [N,3], as well as a rigid motion and a scale can.
-
-    The fit cannot tell size from distance; pictures do not either, so that the camera takes up the difference.
-    """
-    share = (weight / weight.sum())[:, None].double()
-    first, second = points.double(), target.double()
-    centre, aim = (share * first).sum(0), (share * second).sum(0)
-    u, s, vt = torch.linalg.svd(((second - aim) * share).mT @ (first - centre))
-    flip = torch.ones(3, dtype=s.dtype)
-    flip[2] = torch.sign(torch.linalg.det(u @ vt))
-    rotation = (u * flip) @ vt
-    scale = (s * flip).sum() / (share * (first - centre).square()).sum()
-    shift = aim - scale * rotation @ centre
-    viewmat = camera.viewmat.double().clone()
-    outer = viewmat[:3, :3]
-    viewmat[:3, 3] = (outer @ shift + viewmat[:3, 3]) / scale
-    viewmat[:3, :3] = outer @ rotation
-    return Camera(viewmat.float(), camera.K, camera.width, camera.height)
 
 
 def _parameters(view: View) -> HeadParameters:

@@ -19,7 +19,7 @@ from uika.lpips import Lpips
 from uika.model import computes_bfloat16
 from uika.train.checkpoint import Checkpoints, Progress, read_progress
 from uika.train.config import TrainConfig
-from uika.train.export import export
+from uika.train.export import export, load_start
 from uika.train.items import Item, ItemMaker
 from uika.train.logbook import Clock, Logbook
 from uika.train.optimiser import RunningMean, make_optimizer
@@ -44,6 +44,7 @@ class Setup:
     overfit: int = 0  # heads that every step sees, to see whether training works at all; 0 for all people
     sharding: Sharding = "ddp"
     lpips: Path | None = None
+    init: Path | None = None  # a model file whose weights a new training starts from
     progress: bool = True
 
 
@@ -70,6 +71,8 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
     """
     head = load_head() if head is None else head
     task = make_task(config, head, None if setup.lpips is None else Lpips(setup.lpips))
+    if setup.init is not None:
+        load_start(task, setup.init)
     task.network.to(group.device).train()
     if config.checkpointing:
         recompute_activations(task)

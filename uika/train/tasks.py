@@ -82,7 +82,7 @@ class ReconstructionTask:
     def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
         """Weighted losses, and `psnr` in dB for the log."""
         image, alpha = self.render(output, item)
-        _, _, _, opacities, colors, offsets = output
+        means, _, _, opacities, colors, offsets = output
         weights = self._losses
         terms = {
             "l1": weights.l1 * l1(image, item.pictures),
@@ -99,6 +99,8 @@ class ReconstructionTask:
             terms["alpha"] = weights.alpha * alpha_loss(alpha, item.coverage)
         if weights.atlas and len(item.texture):
             terms["atlas"] = weights.atlas * self._atlas(colors, item.texture)
+        if weights.relief:
+            terms["relief"] = weights.relief * l1(means, item.relief)
         square = (image.detach() - item.pictures).square().mean(dim=(1, 2, 3))
         return terms | {"psnr": (-10 * torch.log10(square.clamp_min(1e-10))).mean()}
 
