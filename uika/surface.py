@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import torch
@@ -53,7 +54,15 @@ def surface_texels(
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
     quats = _quaternions(frames)
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
-    return surface, binding
+    return replace(surface, lift=_lift(head, neutral, static_offset, binding)), binding
+
+
+def _lift(head: HeadModel, neutral: HeadParameters, static_offset: Tensor, binding: Binding) -> Tensor:
+    """How far [1,S,S] in metres the surface stands off the bald head along its normals."""
+    bald = shaped_vertices(head, neutral)
+    normals = torch.nn.functional.normalize(vertex_normals(bald, head.faces), dim=-1)
+    height = (static_offset * normals).sum(-1)[head.faces[binding.triangle]]
+    return binding.to_map((height * binding.barycentric).sum(-1, keepdim=True))
 
 
 def _curved(vertices: Tensor, faces: Tensor, binding: Binding, points: Tensor) -> Tensor:

@@ -201,3 +201,14 @@ def test_tiny_answers_fast(make_inputs: Make) -> None:
             model(**inputs)
         times.append(time.process_time() - start)
     assert min(times) < 2.5  # processor seconds of one core
+
+
+def test_a_model_that_reads_the_surface_needs_it_and_uses_it(small: ModelConfig, make_inputs: Make, perturb) -> None:
+    model = perturb(build(dataclasses.replace(small, surface=True)))
+    inputs = make_inputs(views=1, map_size=small.map_size)
+    first = model(**inputs)
+    inputs["surface"] = dataclasses.replace(inputs["surface"], lift=inputs["surface"].lift + 0.05)
+    assert (model(**inputs).means - first.means).abs().max() > 1e-6
+    inputs["surface"] = dataclasses.replace(inputs["surface"], lift=None)
+    with pytest.raises(ValueError, match=r"surface\.lift"):
+        model(**inputs)

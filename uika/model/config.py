@@ -98,6 +98,8 @@ class ModelConfig:
     mlp_width         inner width of the per-texel MLP
     uv_attention      ablation: False drops the UV branch, tokens attend to screen features only
     aggregation       ablation: False hides the aggregate from the decoder and takes predicted colours alone
+    surface           True shows the decoder how far the fitted surface stands off the bald head, which tells hair from
+                      skin where no photo does; not in the paper, whose surface is the same for everybody
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
     """
 
@@ -117,6 +119,7 @@ class ModelConfig:
     gaussians: GaussianConfig
     uv_attention: bool = True
     aggregation: bool = True
+    surface: bool = False
     fusion: Literal["learned", "fixed"] = "learned"
 
     def __post_init__(self) -> None:
@@ -187,6 +190,7 @@ PRESETS: dict[str, ModelConfig] = {
         mlp_width=64,
         uv=UvConfig(),
         gaussians=_SURFACE,
+        surface=True,
     ),
     "base": ModelConfig(
         name="base",

@@ -82,12 +82,12 @@ class UvDpt(nn.Module):
     """Tokens of four depths and the aggregate -> features at four times the token grid."""
 
     def __init__(self, config: ModelConfig) -> None:
-        """Without `config.aggregation` the aggregate's four channels are absent."""
+        """Without `config.aggregation` the aggregate is absent; `config.surface` adds a channel."""
         super().__init__()
-        observed = 4 if config.aggregation else 0
+        observed = 4 * config.aggregation + config.surface
         features, channels = config.dpt_features, config.dpt_projections
         self.grid = config.token_grid
-        self.aggregation = config.aggregation
+        self.observed = observed
         self.projects = nn.ModuleList(nn.Conv2d(config.dim, width, 1) for width in channels)
         self.resize_layers = resize_layers(channels)
         self.layer_rn = nn.ModuleList(
@@ -101,7 +101,7 @@ class UvDpt(nn.Module):
         )
 
     def forward(self, tokens: list[Tensor], aggregate: Tensor) -> Tensor:
-        """Tokens [B,grid^2,D] shallow to deep, aggregate [B,4,S,S] -> features [B,C,4*grid,4*grid]."""
+        """Tokens [B,grid^2,D] shallow to deep, aggregate and more [B,K,S,S] -> features [B,C,4*grid,4*grid]."""
         levels = []
         for depth, project, scale, merge in zip(tokens, self.projects, self.resize_layers, self.layer_rn, strict=True):
             level = scale(project(token_map(depth, (self.grid, self.grid))))
@@ -114,7 +114,7 @@ class UvDpt(nn.Module):
         return self.output_conv(self._observe(x, aggregate))
 
     def _observe(self, level: Tensor, aggregate: Tensor) -> Tensor:
-        if not self.aggregation:
+        if not self.observed:
             return level
         size = (level.shape[-2], level.shape[-1])
         observed = resize(aggregate, size, antialias=True).to(level.dtype)

@@ -19,6 +19,7 @@ class SurfaceTexels:
     mirror  [S,S] int64 row-major index of each texel's counterpart on the other half of the face, -1 where there is
             none; None if unknown
     regions [S,S] int64 labels of parts whose colours do not mix (skin, eyeballs, teeth), or None
+    lift    [1,S,S] metres by which hair stands off the bald head, 0 elsewhere, or None
     prior   [3,S,S] colours for texels that neither a photo nor its mirror image shows, NaN where there is none, or None
     """
 
@@ -28,6 +29,7 @@ class SurfaceTexels:
     mirror: Tensor | None = None
     regions: Tensor | None = None
     prior: Tensor | None = None
+    lift: Tensor | None = None
 
     def rows(self, first: int, last: int) -> SurfaceTexels:
         """The texels from `first` to before `last`; the maps stay whole."""

@@ -18,6 +18,7 @@ from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
+_LIFT_UNIT = 10.0  # channel value of a metre of hair
 _TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
 
 
@@ -28,13 +29,18 @@ class GaussianDecoder(nn.Module):
         """Sizes from `config`."""
         super().__init__()
         self.map_size = config.map_size
+        self.aggregation, self.surface = config.aggregation, config.surface
         self.dpt_decoder = UvDpt(config)
         self.mlp_net = TexelMlp(config.dpt_features, config.mlp_width)
         self.gs_net = AttributeHeads(config)
 
     def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
         """Tokens of four depths, observed [B,4,S,S], texel [M]."""
-        features = resize(self.dpt_decoder(tokens, observed), (self.map_size, self.map_size))
+        maps = [observed] if self.aggregation else []
+        if self.surface and surface.lift is not None:
+            maps.append(_LIFT_UNIT * surface.lift.to(observed.dtype).expand(len(observed), 1, -1, -1))
+        seen_maps = torch.cat(maps, dim=1) if maps else observed
+        features = resize(self.dpt_decoder(tokens, seen_maps), (self.map_size, self.map_size))
         features, seen = _gather(features, texel), _gather(observed, texel)
         # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
         with torch.autocast(features.device.type, enabled=False):
@@ -254,6 +260,8 @@ class Reconstructor(nn.Module):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
+        if self.config.surface and surface.lift is None:
+            raise ValueError("surface.lift is missing, which a model with config.surface needs")
         size = self.config.map_size
         if len(texel) and (int(texel.min()) < 0 or int(texel.max()) >= size * size):
             raise ValueError(f"texel must index an atlas of {size}x{size} texels (config.map_size)")

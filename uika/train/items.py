@@ -45,6 +45,7 @@ class Item:
     quats: Tensor  # [M,4]
     scales: Tensor  # [M,3]
     prior: Tensor  # [3,A,A] supposed colours of the atlas
+    lift: Tensor  # [1,A,A] metres of hair over the bald head
     canonical: Tensor  # [N,3] vertices
     posed: Tensor  # [D,N,3] vertices
     viewmats: Tensor  # [D,4,4]
@@ -112,7 +113,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         keys = tuple(view.key for view in (*photos, *pictures))
         none = torch.zeros(0)
         if config.part == "estimator":
-            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 13)
+            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 14)
         fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
         uv, valid, weight = pixel_uv(fit, head, masks)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -136,6 +137,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             quats=surface.quats[0],
             scales=surface.scales[0],
             prior=none if surface.prior is None else surface.prior,
+            lift=none if surface.lift is None else surface.lift,
             canonical=shaped_vertices(head, HeadParameters.zeros(head).replace(identity=identity), fit.static_offset),
             posed=posed,
             viewmats=cameras.viewmat,

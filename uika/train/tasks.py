@@ -61,6 +61,7 @@ class GaussianNetwork(nn.Module):
             self._mirror.to(device),
             self._regions.to(device),
             item.prior if len(item.prior) else None,
+            item.lift,
         )
         photos = (item.images[None], item.masks[None], item.uv[None], item.weights[None])
         views = self.model.encode(*photos)
