@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -21,28 +22,33 @@ class Observation(NamedTuple):
 
 
 @torch.no_grad()
-def observe(config: UvConfig, sums: Sums, texel: Tensor, surface: SurfaceTexels) -> Observation:
-    """Pool and complete the sums [B,V,...] of all views; the report is described at `Reconstructor.forward`."""
-    batch, views, _, size, _ = sums.weight.shape
+def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: SurfaceTexels) -> Observation:
+    """Pool and complete the sums [C,S,S] of all views of one head; the report: see `Reconstructor.forward`."""
+    size = views[0].weight.shape[-1]
     valid = torch.zeros(size * size, dtype=torch.bool, device=texel.device)
     valid[texel] = True
     valid = valid.view(size, size)
-    pooled = pool(sums, normalization=config.normalization, close_radius=config.close_radius, valid=valid)
+    total = _together(views)
+    pooled = pool(total, normalization=config.normalization, close_radius=config.close_radius, valid=valid)
     empty = int(((pooled.hits <= 0) & valid).sum())
     color = pooled.rgb
     if config.fill:
         share = (pooled.trust / config.full_trust).clamp(0, 1)
         color = fill(color, share, valid, surface.mirror, regions=surface.regions, prior=surface.prior)
     report = {
-        "views": batch * views,
-        "empty_views": int((sums.weight.amax(dim=(2, 3, 4)) <= 0).sum()),
-        "texels": batch * len(texel),
+        "views": len(views),
+        "empty_views": sum(not bool(view.weight.any()) for view in views),
+        "texels": len(texel),
         "empty_texels": empty,
         "completed_texels": empty if config.fill else 0,
     }
     return Observation(color, pooled.confidence, report)
 
 
-def join(views: list[Sums]) -> Sums:
-    """Sums [C,S,S] of single views -> [1,V,C,S,S]."""
-    return Sums(*(torch.stack(parts)[None] for parts in zip(*views, strict=True)))
+def _together(views: Sequence[Sums]) -> Sums:
+    """Sums of single views -> those of all of them as one, [1,1,C,S,S]."""
+    total = Sums(*(part.clone() for part in views[0]))
+    for view in views[1:]:
+        for part, more in zip(total, view, strict=True):
+            part += more
+    return Sums(*(part[None, None] for part in total))

@@ -13,7 +13,7 @@ from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
 from uika.model.heads import AttributeHeads, Attributes, TexelMlp
-from uika.model.observation import Observation, join, observe
+from uika.model.observation import Observation, observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
@@ -156,7 +156,7 @@ class Reconstructor(nn.Module):
 
         With `memory` only the last `newcomers` views pass the transformer; those before are read from the memory.
         """
-        seen = [observe(self.config.uv, join([view.sums for view in views]), texel, surface) for views in items]
+        seen = [observe(self.config.uv, [view.sums for view in views], texel, surface) for views in items]
         color, confidence = torch.cat([each.color for each in seen]), torch.cat([each.confidence for each in seen])
         grid = self.config.token_grid
         kept = None if keep == "all" else covered_tokens(texel, self.config.map_size, grid)
@@ -198,12 +198,17 @@ class Reconstructor(nn.Module):
         texel: Tensor,
         surface: SurfaceTexels,
     ) -> Observation:
-        """The part without learned weights: reprojection, aggregation and filling. Arguments as in `forward`."""
+        """The part without learned weights, of one head: reprojection, aggregation and filling.
+
+        Arguments as in `forward`; B is 1.
+        """
         config = self.config.uv
         weights = pixel_weight if config.grid == "centers" else None
         size = self.config.map_size
         sums = accumulate(images, pixel_uv, masks, size, config.grid, weights, oversample=config.oversample)
-        return observe(config, sums, texel, surface)
+        return observe(
+            config, [Sums(*(part[0, view] for part in sums)) for view in range(images.shape[1])], texel, surface
+        )
 
     def view_size(self, images: Tensor) -> tuple[int, int]:
         """Height and width at which the backbone sees photos [...,H,W]; reprojected ones are squares of the height."""

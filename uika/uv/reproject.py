@@ -101,12 +101,12 @@ def accumulate_sizes(
     _check(images, uv, masks, min(sizes), grid, weights, oversample)
     batch, views = images.shape[:2]
     totals = [torch.zeros(batch * views, 5, size * size, dtype=torch.float64, device=images.device) for size in sizes]
+    scratch = torch.empty(5 * images.shape[3] * images.shape[4], dtype=torch.float64, device=images.device)
     for view in range(batch * views):
         item, index = divmod(view, views)
         trust = None if weights is None else weights[item, index]
         table = _table(images[item, index], uv[item, index], masks[item, index], grid, trust)
         table[2:] /= oversample**2
-        scratch = torch.empty(table[2:].numel(), dtype=torch.float64, device=table.device)
         for sample in _samples(table, oversample):
             payload = scratch[: sample[2:].numel()].view(5, -1).copy_(sample[2:].flatten(1))
             for size, total in zip(sizes, totals, strict=True):
@@ -124,7 +124,8 @@ def _table(image: Tensor, uv: Tensor, mask: Tensor, grid: Grid, weight: Tensor |
     if weight is not None:
         share = share * weight
     coords = uv.float() if grid == "centers" else uv.float().clamp(0, 1)
-    valid = (share[0] > 0) & ((coords >= 0) & (coords <= 1)).all(dim=0)
+    low, high = coords.aminmax(dim=0)
+    valid = (share[0] > 0) & (low >= 0) & (high <= 1)
     rows, columns = (_extent(valid.any(dim=axis)) for axis in (1, 0))
     share, coords = share[:, rows, columns], coords[:, rows, columns]
     # Colours are premultiplied so that samples between two pixels follow the trusted one.
@@ -152,35 +153,39 @@ def _cells(uv: Tensor, size: int, grid: Grid) -> Tensor:
 
 
 def _samples(table: Tensor, oversample: int) -> Iterator[Tensor]:
-    """Yield interpolated rows [7,h,w] for each of the k*k positions inside the pixels' cells."""
+    """Yield interpolated rows [7,h,w] for each of the k*k positions inside the pixels' cells.
+
+    A sample may take the memory of the one before.
+    """
     yield table
     if oversample == 1 or 0 in table.shape:
         return
     right, down, across = table[:, :, 1:], table[:, 1:], table[:, 1:, 1:]
     beside, below = _linked(table, right), _linked(table, down)
     inside = beside[:-1] & below[:, :-1] & _linked(table, across)
+    room = torch.empty(table.numel(), device=table.device)
     fractions = [step / oversample for step in range(1, oversample)]
     for fraction in fractions:
-        yield _between(table, right, fraction, beside)
-        yield _between(table, down, fraction, below)
+        yield _between(table, right, fraction, beside, room)
+        yield _between(table, down, fraction, below, room)
     for x in fractions:
-        edges = _between(table, right, x)
+        edges = torch.lerp(table[:, :, :-1], right, x)
         for y in fractions:
-            yield _between(edges, edges[:, 1:], y, inside)
+            yield _between(edges, edges[:, 1:], y, inside, room)
 
 
 def _linked(table: Tensor, other: Tensor) -> Tensor:
     """Whether pixels of a table and those of its shifted copy both count and lie close in UV."""
     here = table[:, : other.shape[1], : other.shape[2]]
-    close = ((other[:2] - here[:2]).abs_() <= MAX_UV_STEP).all(dim=0)
-    return close & (here[6] > 0) & (other[6] > 0)
+    step = (other[:2] - here[:2]).abs_().amax(dim=0)
+    return (step <= MAX_UV_STEP) & (here[6] > 0) & (other[6] > 0)
 
 
-def _between(table: Tensor, other: Tensor, fraction: float, linked: Tensor | None = None) -> Tensor:
-    """On the way from a table to its shifted copy; pixels that are not linked carry nothing."""
-    sample = torch.lerp(table[:, : other.shape[1], : other.shape[2]], other, fraction)
-    if linked is not None:
-        sample[2:] *= linked
+def _between(table: Tensor, other: Tensor, fraction: float, linked: Tensor, room: Tensor) -> Tensor:
+    """On the way from a table to its shifted copy; pixels that are not linked carry nothing. Lies in `room`."""
+    sample = room[: other.numel()].view(other.shape)
+    torch.lerp(table[:, : other.shape[1], : other.shape[2]], other, fraction, out=sample)
+    sample[2:] *= linked
     return sample
 
 
