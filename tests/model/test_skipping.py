@@ -57,8 +57,11 @@ def test_foreground_is_everything_when_there_is_no_background(model: Reconstruct
     inputs["texel"] = torch.arange(48 * 48)
     count = len(inputs["texel"])
     surface = inputs["surface"]
-    inputs["surface"] = type(surface)(
-        points=torch.zeros(1, count, 3), quats=torch.eye(4)[:1].expand(1, count, 4), scales=torch.ones(1, count, 3)
+    inputs["surface"] = dataclasses.replace(
+        surface,
+        points=torch.zeros(1, count, 3),
+        quats=torch.eye(4)[:1].expand(1, count, 4),
+        scales=torch.ones(1, count, 3),
     )
     dense, kept = run(model, inputs), run(model, inputs, keep="foreground")
     assert kept.report["skipped_patches"] == kept.report["skipped_tokens"] == 0
