@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 _WINDOW, _SIGMA = 11, 1.5
 SSIM_REACH = _WINDOW // 2  # pixels beside one that its similarity depends on
+_PLACE = torch.arange(_WINDOW, dtype=torch.float64) - SSIM_REACH
+SSIM_WINDOW = torch.softmax(-_PLACE.square() / (2 * _SIGMA**2), 0)  # a Gaussian that sums to 1
 _C1, _C2 = 0.01**2, 0.03**2
 _MIN_SIDE = 8  # pixels, of the coarsest level that gradients are compared on
 _SURE = 1e-6
@@ -18,7 +22,7 @@ def l1(image: Tensor, reference: Tensor) -> Tensor:
     return (image - reference).abs().mean()
 
 
-def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
+def ssim_map(image: Tensor, reference: Tensor, blur: Callable[[Tensor], Tensor] | None = None) -> Tensor:
     """Structural similarity of every pixel.
 
     A Gaussian window of 11 pixels (sigma 1.5) with zeros beyond the border, so that the map has the images' size.
@@ -26,6 +30,7 @@ def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
     Args:
         image: [N,C,H,W] in [0,1].
         reference: [N,C,H,W].
+        blur: the window's sums of images [...,H,W], without gradients where that is quicker.
 
     Returns:
         [N,C,H,W] in [-1,1], 1 where the images agree.
@@ -39,7 +44,7 @@ def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
         )
     count = len(image)
     stacked = torch.cat((image, reference, image * image, reference * reference, image * reference))
-    first, second, first_square, second_square, product = _blur(stacked).split(count)
+    first, second, first_square, second_square, product = (blur or _blur)(stacked).split(count)
     first_variance = (first_square - first * first).clamp_min(0)
     second_variance = (second_square - second * second).clamp_min(0)
     covariance = product - first * second
@@ -96,8 +101,6 @@ def variation(maps: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor) -> Tensor:
-    place = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - SSIM_REACH
-    window = (-place.square() / (2 * _SIGMA**2)).exp()
-    window = (window / window.sum()).expand(images.shape[1], 1, 1, _WINDOW)
+    window = SSIM_WINDOW.to(images).expand(images.shape[1], 1, 1, _WINDOW)
     across = functional.conv2d(images, window, padding=(0, SSIM_REACH), groups=images.shape[1])
     return functional.conv2d(across, window.mT, padding=(SSIM_REACH, 0), groups=images.shape[1])

@@ -10,10 +10,12 @@ from torch import Tensor
 
 from uika.evaluate.protocol import Protocol
 from uika.head import HeadModel
+from uika.losses import SSIM_REACH
 from uika.lpips import Lpips
-from uika.metrics import expression_distance, fit_faces, flip_map, keypoint_distance, pose_distance, psnr, ssim
+from uika.metrics import expression_distance, fit_faces, flip_map, keypoint_distance, pose_distance, psnr
 from uika.metrics.arcface import ArcFace, identity_similarity
 from uika.metrics.faces import find_landmarks
+from uika.metrics.image import ssim_pixels
 
 Scores = dict[str, list[float | None]]  # metric -> its value for each frame, None where it has none
 
@@ -89,11 +91,12 @@ def mean(values: Sequence[float | None]) -> float | None:
 
 
 def _picture_scores(image: Tensor, truth: Tensor, mask: Tensor, judges: Judges) -> dict[str, float]:
-    error = flip_map(image, truth)
-    scores = {"PSNR": psnr(image, truth), "SSIM": ssim(image, truth), "FLIP": float(error.mean())}
-    if bool(mask.any()):
+    error, likeness = flip_map(image, truth), ssim_pixels(image, truth)
+    scores = {"PSNR": psnr(image, truth), "SSIM": float(likeness.mean()), "FLIP": float(error.mean())}
+    inner = mask[SSIM_REACH:-SSIM_REACH, SSIM_REACH:-SSIM_REACH]
+    if bool(inner.any()):
         scores["PSNR masked"] = psnr(image, truth, mask)
-        scores["SSIM masked"] = ssim(image, truth, mask)
+        scores["SSIM masked"] = float(likeness[inner].mean())
         scores["FLIP masked"] = float(error[mask].mean())
     if judges.lpips is not None:
         with torch.no_grad():

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.ndimage import correlate1d
 from torch import Tensor
-from torch.nn import functional
 
 from uika.metrics.image import check_pair, chosen
 
@@ -103,6 +103,8 @@ def _blurred(opponent: Tensor, pixels_per_degree: float) -> Tensor:
     for channel, terms in zip(opponent.split(1, dim=1), _SENSITIVITY, strict=True):
         total, weight = torch.zeros_like(channel), torch.zeros((), dtype=channel.dtype)
         for amount, width in terms:
+            if not amount:
+                continue
             line = (-(math.pi**2) * place / width).exp()
             scale = amount * math.sqrt(math.pi / width)
             total = total + scale * _filtered(channel, line, line)
@@ -115,9 +117,8 @@ def _blurred(opponent: Tensor, pixels_per_degree: float) -> Tensor:
 
 def _filtered(channel: Tensor, across: Tensor, down: Tensor) -> Tensor:
     """A separable correlation of [2,1,H,W], with the border's pixels repeated outwards."""
-    radius = len(across) // 2
-    padded = functional.pad(channel, (radius,) * 4, mode="replicate")
-    return functional.conv2d(functional.conv2d(padded, across[None, None, None]), down[None, None, :, None])
+    rows = correlate1d(channel.numpy(), across.numpy(), axis=-1, mode="nearest")
+    return torch.from_numpy(correlate1d(rows, down.numpy(), axis=-2, mode="nearest"))
 
 
 def _colour_error(linear: Tensor) -> Tensor:

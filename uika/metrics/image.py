@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
+from scipy.ndimage import correlate1d
 from torch import Tensor
 
-from uika.losses import SSIM_REACH, ssim_map
+from uika.losses import SSIM_REACH, SSIM_WINDOW, ssim_map
 
 
 def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
@@ -37,13 +38,32 @@ def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
     Raises:
         ValueError: shapes differ, the picture is smaller than the window, or no pixel counts.
     """
+    inner = slice(SSIM_REACH, -SSIM_REACH)
+    return float(chosen(ssim_pixels(image, reference), None if mask is None else mask[inner, inner]).mean())
+
+
+def ssim_pixels(image: Tensor, reference: Tensor) -> Tensor:
+    """The structural similarity of every pixel whose window lies inside, see `ssim`.
+
+    Returns:
+        [H-10,W-10,C] float64 in [-1,1].
+
+    Raises:
+        ValueError: shapes differ, or the picture is smaller than the window.
+    """
     check_pair(image, reference)
     if min(image.shape[:2]) <= 2 * SSIM_REACH:
         raise ValueError(f"image: ssim needs more than {2 * SSIM_REACH} pixels a side, got {list(image.shape[:2])}")
-    first, second = (picture.double().permute(2, 0, 1)[None] for picture in (image, reference))
+    first, second = (picture.permute(2, 0, 1)[None].double() for picture in (image, reference))
     inner = slice(SSIM_REACH, -SSIM_REACH)
-    likeness = ssim_map(first, second)[0].permute(1, 2, 0)[inner, inner]
-    return float(chosen(likeness, None if mask is None else mask[inner, inner]).mean())
+    return ssim_map(first, second, _blur)[0].permute(1, 2, 0)[inner, inner]
+
+
+def _blur(images: Tensor) -> Tensor:
+    # In float64, torch's convolutions take several times as long.
+    window = SSIM_WINDOW.numpy()
+    rows = correlate1d(images.numpy(), window, axis=-1, mode="constant")
+    return torch.from_numpy(correlate1d(rows, window, axis=-2, mode="constant"))
 
 
 def mask_iou(first: Tensor, second: Tensor, threshold: float = 0.5) -> float:
