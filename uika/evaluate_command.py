@@ -22,9 +22,9 @@ class Evaluate:
     """A folder with captures or shards, such as `uika synthesize` makes."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("report")
     """The report's folder."""
-    setting: Literal["mono", "multi"] = "mono"
+    setting: Literal["mono", "multi", "both"] = "mono"
     """Frames of one camera, or of several."""
-    task: Literal["self", "cross"] = "self"
+    task: Literal["self", "cross", "both"] = "self"
     """Whether the person's own held-out frames drive the head, or those of another person."""
     views: str = "1,2,4,8,16"
     """Numbers of source frames, with commas."""
@@ -50,7 +50,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate, write the report and print the table."""
         counts = _counts(self.views)
-        from uika.evaluate import Evaluation, evaluate, gather, write_report
+        from uika.evaluate import Evaluation, evaluate_all, gather, write_report
         from uika.evaluate.report import markdown_table
 
         if self.external is None:
@@ -60,15 +60,20 @@ class Evaluate:
             check_model(self.model)
             check_renderer()
         given = {field.name: getattr(self, field.name) for field in fields(Evaluation)} | {"views": counts}
-        outcome = evaluate(Evaluation(**given), progress=True)
+        settings = ("mono", "multi") if self.setting == "both" else (self.setting,)
+        tasks = ("self", "cross") if self.task == "both" else (self.task,)
+        wanted = [Evaluation(**given | {"setting": s, "task": t}) for s in settings for t in tasks]
+        outcomes = evaluate_all(wanted, progress=True)
         written = write_report(self.output)
         for section in gather(self.output):
-            if (section.setting, section.task) == (self.setting, self.task):
+            if section.setting in settings and section.task in tasks:
                 print("\n".join([section.title, *markdown_table(section)]))
-        print("\n".join(f"- {line}" for line in outcome.protocol.sentences()))
-        for sentence in outcome.missing:
+        lines = dict.fromkeys(line for outcome in outcomes for line in outcome.protocol.sentences())
+        print("\n".join(f"- {line}" for line in lines))
+        for sentence in dict.fromkeys(sentence for outcome in outcomes for sentence in outcome.missing):
             print(f"left out: {sentence}")
-        print(f"{outcome.made} results made, {outcome.kept} were complete")
+        made, kept = (sum(getattr(outcome, name) for outcome in outcomes) for name in ("made", "kept"))
+        print(f"{made} results made, {kept} were complete")
         for path in written:
             print(f"wrote {path}")
         return 0

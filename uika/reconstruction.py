@@ -61,6 +61,13 @@ class Reconstruction:
     report: Report
 
 
+class PreparedPhoto(NamedTuple):
+    """A photo and the matte [S,S] of its head and hair."""
+
+    photo: Photo
+    hair: Tensor
+
+
 class FittedPhotos(NamedTuple):
     """N photos of one person and the heads and cameras fitted to them."""
 
@@ -115,19 +122,39 @@ def fit_files(
     Raises:
         PhotoError: a photo cannot be read or shows no face; the message names it.
     """
-    from uika.correspondence import fit_photos
-    from uika.photo import head_matte, prepare
-
     report = Report() if report is None else report
     with report.stage("photos"):
-        prepared = sorted((prepare(path) for path in photos), key=lambda photo: photo.sha256)
-        hair = [head_matte(photo) for photo in prepared]
+        prepared = [prepare_file(path) for path in photos]
+    return fit_prepared(prepared, head, refine=refine, report=report)
+
+
+def prepare_file(path: str | Path) -> PreparedPhoto:
+    """All that a photo needs before it is fitted together with others.
+
+    Raises:
+        PhotoError: it cannot be read or shows no face; the message names it.
+    """
+    from uika.photo import head_matte, prepare
+
+    photo = prepare(path)
+    return PreparedPhoto(photo, head_matte(photo))
+
+
+def fit_prepared(
+    prepared: Sequence[PreparedPhoto], head: HeadModel, *, refine: bool = False, report: Report | None = None
+) -> FittedPhotos:
+    """Fit the head to prepared photos of one person; they come out in the order of their content hashes."""
+    from uika.correspondence import fit_photos
+
+    report = Report() if report is None else report
+    ordered = sorted(prepared, key=lambda each: each.photo.sha256)
+    photos = [each.photo for each in ordered]
     with report.stage("fit"):
-        pictures = [photo.image for photo in prepared] if refine else None
-        fit = fit_photos(prepared, head, hair, images=pictures)
-    images = torch.stack([photo.image for photo in prepared])
-    mattes = torch.stack([photo.matte for photo in prepared])
-    return FittedPhotos(tuple(prepared), fit, images, mattes, [photo.sha256 for photo in prepared])
+        pictures = [photo.image for photo in photos] if refine else None
+        fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures)
+    images = torch.stack([photo.image for photo in photos])
+    mattes = torch.stack([photo.matte for photo in photos])
+    return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos])
 
 
 @torch.no_grad()

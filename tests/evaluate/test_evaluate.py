@@ -15,7 +15,7 @@ from tests.metrics.lpips_files import write_weights
 from tests.metrics.onnx_files import write_flatten
 from uika.cli import main
 from uika.errors import UikaError
-from uika.evaluate import Evaluation, evaluate, gather, write_report
+from uika.evaluate import Evaluation, evaluate, evaluate_all, gather, write_report
 from uika.evaluate.external import external_file
 from uika.evaluate.heads import truth_picture
 from uika.evaluate.sequences import choose_frames
@@ -271,3 +271,16 @@ def test_wrong_use_is_one_sentence(
 def test_cross_needs_two_people(people: Path, tmp_path: Path) -> None:
     with pytest.raises(UikaError, match="cross reenactment needs two people, and only '000000'"):
         evaluate(Evaluation(people / "captures" / "000000", tmp_path / "r", task="cross", views=(1,)))
+
+
+def test_settings_in_one_go_give_what_they_give_alone(settings: Evaluation, tmp_path: Path) -> None:
+    wanted = [replace(settings, output=tmp_path, views=(1, 2), task=task) for task in ("self", "cross")]
+    outcomes = evaluate_all(wanted)
+    assert [(outcome.made, outcome.kept) for outcome in outcomes] == [(4, 0), (4, 0)]
+    together, alone = results(wanted[0]), results(settings)
+    for name, result in alone.items():
+        for metric, values in result["scores"].items():
+            assert together[name]["scores"][metric] == (
+                values if None in values else pytest.approx(values, abs=1e-9)
+            ), metric
+    assert sorted(section.task for section in gather(tmp_path)) == ["cross", "self"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,15 @@ from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
 from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
-from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files
+from uika.reconstruction import (
+    MAX_PHOTOS,
+    LoadedModel,
+    PreparedPhoto,
+    Report,
+    avatar_from_fit,
+    fit_prepared,
+    prepare_file,
+)
 from uika.rendering import render
 from uika.train.align import aligned_camera
 from uika.train.crops import View
@@ -36,7 +45,34 @@ class Observed(NamedTuple):
     digests: list[str]
 
 
-def observe_sources(sources: Sequence[Sample], correspondence: str, size: int, head: HeadModel) -> Observed:
+class Cutouts:
+    """Source frames as photos that know nothing but pixels and matte, prepared once for all avatars that they serve."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._known: OrderedDict[tuple[str, str], PreparedPhoto] = OrderedDict()
+
+    def photo(self, sample: Sample) -> PreparedPhoto:
+        """Prepare a frame, or remember it.
+
+        Raises:
+            PhotoError: it shows no face that can be found.
+        """
+        name = sample.identity, sample.key
+        if name not in self._known:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"{sample.key}.png"
+                _write_cutout(path, sample)
+                self._known[name] = prepare_file(path)
+        self._known.move_to_end(name)
+        while len(self._known) > MAX_PHOTOS:
+            self._known.popitem(last=False)
+        return self._known[name]
+
+
+def observe_sources(
+    sources: Sequence[Sample], correspondence: str, size: int, head: HeadModel, cutouts: Cutouts | None = None
+) -> Observed:
     """Heads and cameras of source frames: by landmark fits of the pictures ("fit") or their true ones ("exact").
 
     Args:
@@ -44,17 +80,15 @@ def observe_sources(sources: Sequence[Sample], correspondence: str, size: int, h
         correspondence: "fit" or "exact".
         size: pixels of a side of the photos; fits decide by themselves.
         head: the head model.
+        cutouts: what was prepared before.
 
     Raises:
         PhotoError: a source shows no face that can be found.
         DataError: a source lacks the head parameters that "exact" needs.
     """
     if correspondence == "fit":
-        with tempfile.TemporaryDirectory() as folder:
-            paths = [Path(folder) / f"{sample.key}.png" for sample in sources]
-            for path, sample in zip(paths, sources, strict=True):
-                _write_cutout(path, sample)
-            return Observed(*fit_files(paths, head)[1:])
+        cutouts = cutouts or Cutouts()
+        return Observed(*fit_prepared([cutouts.photo(sample) for sample in sources], head)[1:])
     for sample in sources:
         check_sample(sample, head)
     views = [View(sample, size) for sample in sources]
@@ -64,10 +98,16 @@ def observe_sources(sources: Sequence[Sample], correspondence: str, size: int, h
     return Observed(fit, images, torch.stack([view.mask for view in views]), [view.key for view in views])
 
 
-def make_avatar(sources: Sequence[Sample], loaded: LoadedModel, correspondence: str, head: HeadModel) -> Avatar:
+def make_avatar(
+    sources: Sequence[Sample],
+    loaded: LoadedModel,
+    correspondence: str,
+    head: HeadModel,
+    cutouts: Cutouts | None = None,
+) -> Avatar:
     """Reconstruct from source frames; raises as `observe_sources` does."""
     size = loaded.network.config.image_size or _PHOTO_SIDE
-    return avatar_from_fit(loaded, head, *observe_sources(sources, correspondence, size, head), Report())
+    return avatar_from_fit(loaded, head, *observe_sources(sources, correspondence, size, head, cutouts), Report())
 
 
 def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: float) -> list[Tensor]:

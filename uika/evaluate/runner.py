@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from uika.avatar import Avatar
 from uika.data import DataError
 from uika.errors import UikaError
 from uika.evaluate.external import check_external, external_picture
-from uika.evaluate.heads import drive, make_avatar, target_views, truth_picture
+from uika.evaluate.heads import Cutouts, drive, make_avatar, target_views, truth_picture
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.score import Judges, Pictures, faces_found, score
 from uika.evaluate.sequences import Sequence, choose_frames
@@ -39,6 +41,7 @@ from uika.train.crops import View
 from uika.train.people import find_people
 from uika.weights import sha256
 
+TRUTHS = 4  # sequences whose targets are remembered
 SHOWN = 2  # targets of each result that pictures are kept of
 _SIZES = (32, 2048)
 
@@ -82,7 +85,20 @@ class _Truth:
     masks: list[Tensor]
 
 
-@torch.no_grad()
+@dataclass
+class _Plan:
+    """What one table needs, and what of it is done."""
+
+    settings: Evaluation
+    protocol: Protocol
+    folder: Path
+    drivers: dict[str, Sequence]  # by the name of the sequence that they drive
+    jobs: list[tuple[Sequence, int]]  # with the number of views
+    missing: list[str]
+    made: int = 0
+    kept: int = 0
+
+
 def evaluate(settings: Evaluation, head: HeadModel | None = None, progress: bool = False) -> Outcome:
     """Score all sequences that have no result yet; `uika.evaluate.write_report` makes the tables.
 
@@ -90,19 +106,54 @@ def evaluate(settings: Evaluation, head: HeadModel | None = None, progress: bool
         UikaError: the settings, the data or a weights file cannot be used, the report's folder holds results of other
             choices, or frames of the other system are missing.
     """
-    _check(settings)
+    return evaluate_all([settings], head, progress)[0]
+
+
+@torch.no_grad()
+def evaluate_all(
+    many: Iterable[Evaluation], head: HeadModel | None = None, progress: bool = False
+) -> tuple[Outcome, ...]:
+    """Fill several tables of one model that differ in setting and task: each avatar is made once for all of them.
+
+    Raises:
+        UikaError: as `evaluate` does.
+    """
+    wanted = list(many)
+    first = wanted[0]
+    for settings in wanted:
+        _check(settings)
     head = load_head() if head is None else head
-    loaded = None if settings.external else load_model(settings.model)
+    loaded = None if first.external else load_model(first.model)
     judges = Judges(
         head,
-        None if settings.lpips is None else Lpips(settings.lpips),
-        None if settings.arcface is None else ArcFace(settings.arcface),
+        None if first.lpips is None else Lpips(first.lpips),
+        None if first.arcface is None else ArcFace(first.arcface),
     )
+    plans = [_plan(settings, loaded, head) for settings in wanted]
+    run = _Run(loaded, judges)
+    # All that shares frames comes together.
+    jobs = sorted(
+        ((sequence, views, plan) for plan in plans for sequence, views in plan.jobs),
+        key=lambda job: (job[0].name, job[2].settings.setting, job[1]),
+    )
+    for sequence, views, plan in counted(jobs, progress, len(jobs), "evaluate"):
+        if read_result(result_file(plan.folder, sequence.name, views), plan.protocol) is not None:
+            plan.kept += 1
+            continue
+        try:
+            write_result(plan.folder, run.result(plan, sequence, views))
+            plan.made += 1
+        except (DataError, PhotoError) as error:
+            plan.missing.append(f"{sequence.name} with {views} views: {error}")
+    return tuple(Outcome(plan.protocol, plan.made, plan.kept, tuple(plan.missing)) for plan in plans)
+
+
+def _plan(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> _Plan:
+    """Choose frames, and make sure that the report's folder and another system's pictures fit them."""
     protocol = _protocol(settings, loaded, head)
-    paths = find_people(settings.data)
     missing: list[str] = []
     sequences = []
-    for path in paths:
+    for path in find_people(settings.data):
         try:
             sequences.append(choose_frames(path, settings.setting, settings.targets, head))
         except DataError as error:
@@ -123,43 +174,31 @@ def evaluate(settings: Evaluation, head: HeadModel | None = None, progress: bool
         check_external(settings.external, [(s.name, v, drivers[s.name].target_names) for s, v in jobs])
     folder = agree(check_folder(settings.output), protocol)
     write_frames(folder, {s.name: _frames(s, drivers[s.name]) for s in sequences})
-    made = kept = 0
-    run = _Run(settings, protocol, loaded, judges)
-    for sequence, views in counted(jobs, progress, len(jobs), "evaluate"):
-        if read_result(result_file(folder, sequence.name, views), protocol) is not None:
-            kept += 1
-            continue
-        try:
-            write_result(folder, run.result(sequence, drivers[sequence.name], views))
-            made += 1
-        except (DataError, PhotoError) as error:
-            missing.append(f"{sequence.name} with {views} views: {error}")
-    return Outcome(protocol, made, kept, tuple(missing))
+    return _Plan(settings, protocol, folder, drivers, jobs, missing)
 
 
 class _Run:
-    """One evaluation; the driver's faces are looked for once for all numbers of views."""
+    """One evaluation; faces, photos and avatars that several results need are made once."""
 
-    def __init__(self, settings: Evaluation, protocol: Protocol, loaded: LoadedModel | None, judges: Judges) -> None:
-        self._settings, self._protocol, self._loaded, self._judges = settings, protocol, loaded, judges
-        self._truths: dict[str, _Truth] = {}
+    def __init__(self, loaded: LoadedModel | None, judges: Judges) -> None:
+        self._loaded, self._judges = loaded, judges
+        self._cutouts = Cutouts()
+        self._truths: OrderedDict[tuple[object, ...], _Truth] = OrderedDict()
+        self._avatar: tuple[object, Avatar, float] | None = None
 
-    def result(self, sequence: Sequence, driver: Sequence, views: int) -> Result:
+    def result(self, plan: _Plan, sequence: Sequence, views: int) -> Result:
         """Make an avatar of a sequence and score it."""
-        protocol, judges = self._protocol, self._judges
-        sources = [sequence.person.sample(index) for index in sequence.sources[:views]]
-        truth, seconds = self._truth(driver), 0.0
+        protocol, judges, driver = plan.protocol, self._judges, plan.drivers[sequence.name]
+        truth, seconds = self._truth(driver, protocol), 0.0
         if self._loaded is None:
-            assert self._settings.external is not None
-            place = self._settings.external, sequence.name, views
+            assert plan.settings.external is not None
+            place = plan.settings.external, sequence.name, views
             images = [external_picture(*place, name, protocol.size) for name in driver.target_names]
         else:
-            start = time.perf_counter()
-            avatar = make_avatar(sources, self._loaded, self._settings.correspondence, judges.head)
-            seconds = time.perf_counter() - start
+            avatar, seconds = self._made(sequence, views, plan.settings.correspondence)
             images = drive(avatar, truth.views, judges.head, protocol.background)
         results = Pictures.of(images)
-        shown = truth_picture(View(sources[0], protocol.size), protocol.background)
+        shown = truth_picture(View(sequence.person.sample(sequence.sources[0]), protocol.size), protocol.background)
         person = Pictures.of([shown] if judges.arcface is not None and protocol.task == "cross" else [])
         return Result(
             protocol=protocol.digest(),
@@ -171,27 +210,43 @@ class _Run:
             scores=score(results, truth.pictures, truth.masks, person, protocol, judges),
             faces=len(faces_found(results, truth.pictures)),
             seconds=round(seconds, 2),
-            pictures=tuple(self._strips(sequence, views, shown, results, truth)),
+            pictures=tuple(_strips(plan, sequence, views, shown, results, truth)),
         )
 
-    def _truth(self, driver: Sequence) -> _Truth:
-        if driver.name not in self._truths:
-            samples = [driver.person.sample(index) for index in driver.targets]
-            views = target_views(samples, self._protocol, self._judges.head)
-            pictures = Pictures.of([truth_picture(view, self._protocol.background) for view in views])
-            self._truths = {driver.name: _Truth(views, pictures, [view.mask >= 0.5 for view in views])}
-        return self._truths[driver.name]
+    def _made(self, sequence: Sequence, views: int, correspondence: str) -> tuple[Avatar, float]:
+        """The avatar of a sequence and the seconds that it took; the last one is remembered."""
+        assert self._loaded is not None
+        name = sequence.name, sequence.source_names[:views], correspondence
+        if self._avatar is None or self._avatar[0] != name:
+            samples = [sequence.person.sample(index) for index in sequence.sources[:views]]
+            start = time.perf_counter()
+            avatar = make_avatar(samples, self._loaded, correspondence, self._judges.head, self._cutouts)
+            self._avatar = name, avatar, time.perf_counter() - start
+        return self._avatar[1], self._avatar[2]
 
-    def _strips(
-        self, sequence: Sequence, views: int, source: Tensor, results: Pictures, truth: _Truth
-    ) -> Iterator[str]:
-        """Write pictures of the first targets; paths inside the report's folder."""
-        protocol, report = self._protocol, self._settings.output
-        place = Path(PICTURES) / f"{protocol.setting}-{protocol.task}" / plain_name(protocol.method)
-        for index in range(min(SHOWN, len(results.images))):
-            name = place / f"{plain_name(sequence.name)}_{views:02d}_{index}.png"
-            write_strip(report / name, source, results.images[index], truth.pictures.images[index], protocol.task)
-            yield name.as_posix()
+    def _truth(self, driver: Sequence, protocol: Protocol) -> _Truth:
+        name = driver.name, driver.target_names, protocol.size, protocol.background
+        if name not in self._truths:
+            samples = [driver.person.sample(index) for index in driver.targets]
+            views = target_views(samples, protocol, self._judges.head)
+            pictures = Pictures.of([truth_picture(view, protocol.background) for view in views])
+            self._truths[name] = _Truth(views, pictures, [view.mask >= 0.5 for view in views])
+        self._truths.move_to_end(name)
+        while len(self._truths) > TRUTHS:
+            self._truths.popitem(last=False)
+        return self._truths[name]
+
+
+def _strips(
+    plan: _Plan, sequence: Sequence, views: int, source: Tensor, results: Pictures, truth: _Truth
+) -> Iterator[str]:
+    """Write pictures of the first targets; paths inside the report's folder."""
+    protocol, report = plan.protocol, plan.settings.output
+    place = Path(PICTURES) / f"{protocol.setting}-{protocol.task}" / plain_name(protocol.method)
+    for index in range(min(SHOWN, len(results.images))):
+        name = place / f"{plain_name(sequence.name)}_{views:02d}_{index}.png"
+        write_strip(report / name, source, results.images[index], truth.pictures.images[index], protocol.task)
+        yield name.as_posix()
 
 
 def _driver(sequences: list[Sequence], index: int, settings: Evaluation) -> Sequence:

@@ -138,7 +138,7 @@ def _hunt(lab: Tensor) -> Tensor:
 
 def _distance(lab: Tensor) -> Tensor:
     difference = lab[0] - lab[1]
-    return difference[0].abs() + difference[1:].norm(dim=0)
+    return difference[0].abs() + torch.hypot(difference[1], difference[2])
 
 
 def _feature_error(luminance: Tensor, pixels_per_degree: float) -> Tensor:
@@ -153,6 +153,6 @@ def _feature_error(luminance: Tensor, pixels_per_degree: float) -> Tensor:
         line = shape * smooth
         # Rising and falling parts weigh the same, whatever the sampling.
         line = torch.where(line > 0, line / line.clamp_min(0).sum(), line / -line.clamp_max(0).sum())
-        strength = torch.cat((_filtered(luminance, line, smooth), _filtered(luminance, smooth, line)), 1).norm(dim=1)
+        strength = torch.hypot(_filtered(luminance, line, smooth), _filtered(luminance, smooth, line))[:, 0]
         differences.append((strength[0] - strength[1]).abs())
     return (torch.maximum(*differences) / math.sqrt(2)) ** _FEATURE_POWER
