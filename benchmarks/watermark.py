@@ -96,7 +96,7 @@ def summary(name: str, marked: list[float], plain: list[float] | None = None) ->
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--avatar", type=Path, help="an avatar file; by default one made from the bundled portrait")
+    parser.add_argument("avatar", type=Path, nargs="?", help="by default one made from the bundled portrait")
     parser.add_argument("--pictures", type=int, default=24, help="for each handling")
     parser.add_argument("--unmarked", type=int, default=200, help="pictures to look for false alarms in")
     arguments = parser.parse_args(argv)
