@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import drjit as dr
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.filming import Stage
 from uika.head import HeadModel, HeadParameters, pose_gaussians, shaped_vertices
+
+if TYPE_CHECKING:
+    from uika.head.rig import Posed
 
 UNITS = 100.0  # of the page for a metre: covariances in square metres would be too small for half precision
 Paint = Literal["photo", "UV"]
@@ -63,24 +67,28 @@ class LiveSplats:
         vertices, turn = self._stage.meshes(many)
         posed = self._stage.rig.pose(vertices[0], turn[0])
         count = len(self.avatar)
-        means, quats, scales = (
-            array.numpy().reshape(count, size) for array, size in zip(posed, (3, 4, 3), strict=True)
-        )
-        self._buffer[:, :3] = (means * np.float32(UNITS)).view(np.uint32)
-        self._buffer[:, 4:7] = _covariances(quats, scales * np.float32(UNITS)).view(np.uint32)
+        covariances = _covariances(posed, count).numpy().reshape(count, 6)
+        np.multiply(posed.means.numpy().reshape(count, 3), np.float32(UNITS), out=self._buffer[:, :3].view(np.float32))
+        self._buffer[:, 4:7] = covariances.view(np.uint32)
         return self._buffer.copy(), vertices[0].numpy() * np.float32(UNITS)
 
 
-def _covariances(quats: NDArray[np.float32], scales: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Upper triangles [N,6] (xx xy xz yy yz zz) of the covariances."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    a, b, c = scales.T
+def _covariances(posed: Posed, count: int) -> Any:
+    """Upper triangles [N * 6] (xx xy xz yy yz zz) of the covariances in the page's units, half precision."""
+    from drjit.llvm import Float, Float16, UInt32
+
+    i = dr.arange(UInt32, count)
+    a, b, c = (UNITS * dr.gather(Float, posed.scales, 3 * i + k) for k in range(3))
+    quat = [dr.gather(Float, posed.quats, 4 * i + k) for k in range(4)]
+    shrink = dr.rsqrt(sum(q * q for q in quat))
+    w, x, y, z = (q * shrink for q in quat)
     rows = (
         (a * (1 - 2 * (y * y + z * z)), b * 2 * (x * y - w * z), c * 2 * (x * z + w * y)),
         (a * 2 * (x * y + w * z), b * (1 - 2 * (x * x + z * z)), c * 2 * (y * z - w * x)),
         (a * 2 * (x * z - w * y), b * 2 * (y * z + w * x), c * (1 - 2 * (x * x + y * y))),
     )
-    result = np.empty((len(quats), 6), np.float16)
-    for place, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-        result[:, place] = sum(one * other for one, other in zip(rows[i], rows[j], strict=True))
+    result = dr.empty(Float16, 6 * count)
+    for place, (one, other) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        covariance = sum(p * q for p, q in zip(rows[one], rows[other], strict=True))
+        dr.scatter(result, Float16(covariance), 6 * i + place, mode=dr.ReduceMode.Permute)
     return result
