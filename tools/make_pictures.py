@@ -21,13 +21,14 @@ SIDE = 420  # pixels
 
 def viewer(avatar: Avatar) -> Image.Image:
     """The viewer with an open mouth."""
-    with tempfile.TemporaryDirectory() as folder, Viewer(avatar, load_head()) as shown, page(Path(folder)) as tab:
+    place = tempfile.TemporaryDirectory()
+    with place as folder, Viewer(avatar, load_head()) as shown, page(Path(folder), 1150, 760) as tab:
         tab.open(shown.url)
         tab.wait("document.querySelectorAll('[role=slider]').length >= 6")
         time.sleep(8)
         tab.run("document.querySelector('[role=slider]').focus()")
-        for _ in range(5):
-            tab.key("PageUp", 33)
+        for _ in range(45):
+            tab.key("ArrowRight", 39)
         tab.run("document.querySelector('.mantine-Notification-closeButton')?.click()")
         time.sleep(8)
         return Image.open(io.BytesIO(tab.screenshot())).convert("RGB")

@@ -45,8 +45,13 @@ class LiveSplats:
             corners = self._head.uvs[self._head.uv_faces[self.avatar.triangle]]
             uv = (corners * self.avatar.barycentric[..., None]).sum(1)
             shown = torch.cat((uv, torch.zeros(len(uv), 1)), -1)
+        self._shown = shown
         rgba = torch.cat((shown, self.avatar.opacities[:, None]), -1).clamp(0, 1)
         self._buffer[:, 7:8] = (rgba * 255).round().byte().numpy().view(np.uint32)
+
+    def painted(self) -> Avatar:
+        """The avatar in the colours that are shown."""
+        return dataclasses.replace(self.avatar, colors=self._shown)
 
     def reshape(self, identity: Tensor) -> None:
         """Give the avatar another identity [K]; its Gaussians follow the surface."""

@@ -200,6 +200,9 @@ class Viewer:
         camera = client.camera
         view = (camera.wxyz, camera.position, camera.fov)
         width = round(_STILL * camera.aspect)
+        mesh = self._mesh
+        if mesh is not None:  # the rasterizer draws no mesh
+            mesh.visible = False
         try:
             shot = client.get_render(
                 _STILL, width, wxyz=view[0], position=view[1], fov=view[2], transport_format="png", timeout=60.0
@@ -207,10 +210,13 @@ class Viewer:
         except TimeoutError:
             self._verdict.content = "the browser sent no picture within 60 s; try again"
             return
+        finally:
+            if mesh is not None:
+                mesh.visible = True
         self._jobs.put(lambda: self._compare(shot, view))
 
     def _compare(self, shot: Any, view: Any) -> None:
-        picture, difference, decibels = compare(self.live.avatar, self._head, self._params, shot, view)
+        picture, difference, decibels = compare(self.live.painted(), self._head, self._params, shot, view)
         self._still.image = to_bytes(mark(picture) if self._watermark else picture)
         self._error.image = to_bytes(difference)
         self._still.visible = self._error.visible = True
