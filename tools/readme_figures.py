@@ -1,6 +1,6 @@
 """Put the tables of `benchmarks/results/NAME.md` between the markers `<!-- figures: NAME -->` of README and docs.
 
-The benchmarks' pictures are copied to `docs/pictures`.
+The benchmarks' pictures that a page shows are copied to `docs/pictures`.
 """
 
 import re
@@ -23,9 +23,12 @@ def main() -> int:
         lines = [line for line in path.read_text().strip().splitlines() if not line.startswith(("# ", "![]("))]
         return f"{match[1]}{chr(10).join(lines).strip()}\n{match[3]}"
 
+    pages = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    shown = "".join(page.read_text() for page in pages)
     for picture in sorted((ROOT / "benchmarks" / "results").glob("*.png")):
-        shutil.copy(picture, ROOT / "docs" / "pictures" / picture.name)
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        if f"pictures/{picture.name}" in shown:
+            shutil.copy(picture, ROOT / "docs" / "pictures" / picture.name)
+    for page in pages:
         page.write_text(MARKED.sub(table, page.read_text()))
     for path in missing:
         print(f"no {path.relative_to(ROOT)}: run the benchmark first", file=sys.stderr)
