@@ -34,6 +34,7 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "animation": ("--quick",),
     "posing": ("--repeats", "2"),
     "model_latency": ("--views", "1", "--configurations", "fp32 dense"),
+    "model_skipping": ("--views", "1", "--photos", "2", "--repeats", "1"),
     "tracking": ("--seconds", "1"),
     "fit_accuracy": ("--people", "1", "--refined", "0"),
     "mitsuba_spp": ("--size", "64", "--reference", "64", "--renders", "20"),

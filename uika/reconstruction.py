@@ -20,7 +20,7 @@ from uika.head import HeadModel, load_head
 if TYPE_CHECKING:
     from uika.correspondence import Fit
     from uika.feeding import ModelInputs
-    from uika.model import Reconstructor
+    from uika.model import Keep, Reconstructor
     from uika.photo import Photo
 
 MAX_PHOTOS = 64
@@ -84,6 +84,7 @@ def reconstruct(
     model: str | Path = "tiny",
     *,
     refine: bool = False,
+    keep: Keep = "all",
     report: Report | None = None,
 ) -> Reconstruction:
     """Make an avatar from photos of one person.
@@ -96,6 +97,7 @@ def reconstruct(
         model: "tiny", the built-in network; "none", which keeps the photos' colours on the fitted surface and runs no
             network; or the path of a trained model (.safetensors).
         refine: whether to refine the fit with the colours that two or more photos share.
+        keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
         report: filled while the stages pass; None makes a new one.
 
     Raises:
@@ -110,7 +112,9 @@ def reconstruct(
         loaded = load_model(model)
         head = load_head() if head is None else head
     observed = fit_files(photos, head, refine=refine, report=report)
-    avatar = avatar_from_fit(loaded, head, observed.fit, observed.images, observed.mattes, observed.digests, report)
+    avatar = avatar_from_fit(
+        loaded, head, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
+    )
     return Reconstruction(avatar, observed.photos, observed.fit, report)
 
 
@@ -166,6 +170,7 @@ def avatar_from_fit(
     mattes: Tensor,
     digests: Sequence[str],
     report: Report,
+    keep: Keep = "all",
 ) -> Avatar:
     """Make an avatar from photos whose head and cameras are known.
 
@@ -177,6 +182,7 @@ def avatar_from_fit(
         mattes: [N,S,S] in [0,1].
         digests: what identifies the photos, for the avatar's provenance.
         report: gets times and counts.
+        keep: as in `reconstruct`.
     """
     from uika.correspondence import pixel_uv
     from uika.feeding import model_inputs
@@ -187,7 +193,7 @@ def avatar_from_fit(
     with report.stage("reconstruction"):
         identity, config = fit.parameters.identity[0], loaded.network.config
         inputs, binding = model_inputs(config, head, identity, fit.static_offset, images, mattes, uv, weight)
-        means, quats, scales, opacities, colors, counts = _gaussians(loaded, inputs)
+        means, quats, scales, opacities, colors, counts = _gaussians(loaded, inputs, keep)
     report.counts.update(counts)
     return Avatar(
         head_id=head.id,
@@ -236,12 +242,12 @@ def load_model(model: str | Path) -> LoadedModel:
 
 
 def _gaussians(
-    loaded: LoadedModel, inputs: ModelInputs
+    loaded: LoadedModel, inputs: ModelInputs, keep: Keep
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
     """Means, quats, scales, opacities, colours (batch first) and counts, from the network or from the surface alone."""
     network = loaded.network
     if loaded.run:
-        result = network(*inputs)
+        result = network(*inputs, keep)
         counts = dict(result.report)
         return result.means, result.quats, result.scales, result.opacities, result.colors, counts
     seen = network.observe(*inputs)

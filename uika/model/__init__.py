@@ -11,7 +11,7 @@ from uika.model.config import (
     UvConfig,
 )
 from uika.model.estimator import Estimator
-from uika.model.features import FeatureCache, ViewFeatures
+from uika.model.features import FeatureCache, Keep, ViewFeatures
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels, multiply_quaternions
 from uika.model.observation import Observation
 from uika.model.precision import compile_blocks, computes_bfloat16
@@ -28,6 +28,7 @@ __all__ = [
     "EstimatorConfig",
     "FeatureCache",
     "GaussianConfig",
+    "Keep",
     "ModelConfig",
     "Observation",
     "Reconstructor",
