@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from uika.acting import get_motion
     from uika.avatar import Avatar, AvatarError
     from uika.errors import UikaError
+    from uika.growing import GrowingAvatar
     from uika.head import Camera, HeadModel, HeadParameters, load_head
     from uika.motion import Motion, MotionError, load_motion
     from uika.reconstruction import Reconstruction, reconstruct
@@ -24,6 +25,7 @@ _HOMES = {
     "Avatar": "avatar",
     "AvatarError": "avatar",
     "Camera": "head",
+    "GrowingAvatar": "growing",
     "HeadModel": "head",
     "HeadParameters": "head",
     "Motion": "motion",
@@ -46,6 +48,7 @@ __all__ = [
     "Avatar",
     "AvatarError",
     "Camera",
+    "GrowingAvatar",
     "HeadModel",
     "HeadParameters",
     "Motion",

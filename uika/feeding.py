@@ -12,7 +12,7 @@ from uika.complete import MOUTH, regions, suppose
 from uika.head import Binding, HeadModel
 from uika.model import ModelConfig, SurfaceTexels
 from uika.surface import surface_texels
-from uika.uv import aggregate
+from uika.uv import Aggregate, aggregate
 
 _MID_FACE = 0.55  # sRGB level of skin in even light, for judging how bright the photos are
 
@@ -53,25 +53,37 @@ def model_inputs(
     """
     surface, binding = surface_texels(head, identity, static_offset, config.map_size)
     views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
-    weights = weights * _plausible(regions(head, binding), uvs)
+    weights = weights * plausible(head, binding, uvs)
     oversample = config.uv.oversample
     pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=oversample)
-    known = (pooled.trust[0, 0] / config.uv.full_trust).clamp(0, 1)
-    prior = suppose(head, binding, static_offset, pooled.rgb[0], known, _brightness(images, weight))
+    prior = supposed(config, head, binding, static_offset, pooled, levels(images, weight))
     return ModelInputs(views, masks, uvs, weights, binding.texel, replace(surface, prior=prior)), binding
 
 
-def _plausible(labels: Tensor, uv: Tensor) -> Tensor:
+def supposed(
+    config: ModelConfig, head: HeadModel, binding: Binding, static_offset: Tensor, pooled: Aggregate, levels: Tensor
+) -> Tensor:
+    """Colours [3,S,S] for what no photo shows, from all photos pooled and the `levels` of their pixels."""
+    known = (pooled.trust[0, 0] / config.uv.full_trust).clamp(0, 1)
+    return suppose(head, binding, static_offset, pooled.rgb[0], known, _brightness(levels))
+
+
+def plausible(head: HeadModel, binding: Binding, uv: Tensor) -> Tensor:
     """0 for pixels [1,V,1,H,W] that seem to show the inside of the mouth, else 1.
 
     A fit that is a millimetre off puts teeth on the tongue, where they stay when the mouth opens.
     """
+    labels = regions(head, binding)
     size = len(labels)
     column, row = (torch.nan_to_num(uv) * size).long().clamp(0, size - 1).unbind(2)
     return (labels[row, column] != MOUTH).to(uv.dtype)[:, :, None]
 
 
-def _brightness(images: Tensor, weight: Tensor) -> float:
-    """How bright the photos show the head: median level of its well-seen pixels over that of skin in even light."""
-    levels = images.mean(1)[weight > 0.5]
+def levels(images: Tensor, weight: Tensor) -> Tensor:
+    """Grey levels [P] of the pixels of photos [N,3,H,W] that show the head well, by their trust [N,H,W]."""
+    return images.mean(1)[weight > 0.5]
+
+
+def _brightness(levels: Tensor) -> float:
+    """How bright the photos show the head: the median level over that of skin in even light."""
     return 1.0 if len(levels) == 0 else float((levels.median() / _MID_FACE).clamp(0.3, 1.15))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 from uika._version import __version__
 from uika.avatar import Avatar
 from uika.errors import UikaError
-from uika.head import HeadModel, load_head
+from uika.head import Binding, HeadModel, load_head
 
 if TYPE_CHECKING:
     from uika.correspondence import Fit
@@ -195,20 +195,29 @@ def avatar_from_fit(
         inputs, binding = model_inputs(config, head, identity, fit.static_offset, images, mattes, uv, weight)
         means, quats, scales, opacities, colors, counts = _gaussians(loaded, inputs, keep)
     report.counts.update(counts)
+    gaussians = (means, quats, scales, opacities, colors)
+    return assemble(loaded.name, head, fit, gaussians, binding, digests)
+
+
+def assemble(
+    model: str, head: HeadModel, fit: Fit, gaussians: Iterable[Tensor], binding: Binding, digests: Sequence[str]
+) -> Avatar:
+    """An avatar of means, quats, scales, opacities and colours, batch dimension 1, made by the model of this name."""
+    means, quats, scales, opacities, colors = (part[0] for part in gaussians)
     return Avatar(
         head_id=head.id,
-        identity=identity.clone(),
+        identity=fit.parameters.identity[0].clone(),
         static_offset=fit.static_offset,
-        means=means[0],
-        quats=quats[0],
-        scales=scales[0],
-        opacities=opacities[0],
-        colors=colors[0].clamp(0, 1),
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        colors=colors.clamp(0, 1),
         triangle=binding.triangle,
         barycentric=binding.barycentric,
         provenance={
             "program": f"uika-drjit {__version__}",
-            "model": loaded.name,
+            "model": model,
             "photos": " ".join(digests),
         },
     )

@@ -51,6 +51,7 @@ def fit_photos(
     *,
     images: Sequence[Tensor] | None = None,
     correct_detector: bool = False,
+    known: Fit | None = None,
 ) -> Fit:
     """Fit one identity to all photos and expression, camera and hair to each (float32).
 
@@ -61,6 +62,7 @@ def fit_photos(
         images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours they share; None does not.
         correct_detector: take the face mesh's mean error on turned faces out of the landmarks first. It brings the
             shape nearer to the truth, but two views of one head then agree less in colour.
+        known: an earlier fit of the person, whose identity and hair are kept as they are.
 
     Raises:
         ValueError: there is no photo, or the photos have different sizes.
@@ -74,8 +76,9 @@ def fit_photos(
     landmarks = torch.stack([photo.landmarks for photo in photos])
     if correct_detector:
         landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width), head)
-    found, gain = fit_landmarks(landmarks, head, width), None
-    if images is not None:
+    identity = None if known is None else known.parameters.identity[0]
+    found, gain = fit_landmarks(landmarks, head, width, identity), None
+    if images is not None and known is None:
         found, gain = refine_landmark_fit(found, images, landmarks, head)
     N = len(photos)
     viewmat = torch.eye(4).repeat(N, 1, 1)
@@ -87,7 +90,7 @@ def fit_photos(
     parameters = HeadParameters.zeros(head, N).replace(
         identity=found.identity.float().expand(N, -1).contiguous(), expression=found.expression.float()
     )
-    offset = torch.zeros_like(head.template)
-    if head_mattes is not None:
+    offset = torch.zeros_like(head.template) if known is None else known.static_offset
+    if head_mattes is not None and known is None:
         offset = fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
     return Fit(parameters, cameras, offset, found.error.float(), gain)

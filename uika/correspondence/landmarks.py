@@ -68,15 +68,17 @@ class _Problem:
     free: Tensor  # [E] 1 where the expression is fitted
     pixel_unit: Tensor  # [N] pixels of one outer eye-corner distance
     identity_prior: float
+    known: bool  # whether the identity stays as it is
 
 
-def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
+def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int, identity: Tensor | None = None) -> LandmarkFit:
     """Fit the head to N photos.
 
     Args:
         landmarks: [N,478,2] pixels in square crops of `size`, centres at +0.5.
         head: the head model (with its landmark embedding).
         size: side of the crops; the principal point is taken at the centre.
+        identity: [K] of a person known from before; None fits it too.
 
     Raises:
         ValueError: the landmarks have another shape or are not finite.
@@ -102,11 +104,12 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int) -> LandmarkFit:
         free=torch.tensor([name not in UNFITTED for name in exact.expression_names], dtype=torch.float64),
         pixel_unit=torch.ones(len(landmarks), dtype=torch.float64),
         identity_prior=IDENTITY_PRIOR[0],
+        known=identity is not None,
     )
     rotation, translation, focal, unit = _weak_perspective(problem, eye_distance(exact))
     problem = replace(problem, pixel_unit=unit)
     state = LandmarkFit(
-        torch.zeros(K, dtype=torch.float64),
+        torch.zeros(K, dtype=torch.float64) if identity is None else identity.double(),
         torch.zeros(N, E, dtype=torch.float64),
         rotation,
         translation,
@@ -175,7 +178,7 @@ def _solve(problem: _Problem, state: LandmarkFit, steps: int) -> LandmarkFit:
     for _ in range(steps):
         system = _normal_equations(problem, state)
         while damping < MAX_DAMPING:
-            trial = _apply(state, *_schur_step(*system, damping))
+            trial = _apply(state, *(_own_steps if problem.known else _schur_step)(*system, damping))
             trial_cost = _cost(problem, trial)
             if trial_cost <= cost:
                 break
@@ -239,6 +242,12 @@ def _schur_step(A: Tensor, B: Tensor, C: Tensor, a: Tensor, c: Tensor, damping: 
     right = a - (B @ eliminated[..., -1:]).sum(0)[:, 0]
     shared = -torch.linalg.solve(reduced, right)
     return shared, -(eliminated[..., -1] + eliminated[..., :-1] @ shared)
+
+
+def _own_steps(A: Tensor, B: Tensor, C: Tensor, a: Tensor, c: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """The photos' steps [N,P] where nothing is shared; the shared step [K] is 0."""
+    C = C + torch.diag_embed(damping * C.diagonal(dim1=-2, dim2=-1) + 1e-9)
+    return torch.zeros_like(a), -torch.cholesky_solve(c[..., None], torch.linalg.cholesky(C))[..., 0]
 
 
 def _apply(state: LandmarkFit, shared: Tensor, photos: Tensor) -> LandmarkFit:

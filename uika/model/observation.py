@@ -28,7 +28,7 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
     valid = torch.zeros(size * size, dtype=torch.bool, device=texel.device)
     valid[texel] = True
     valid = valid.view(size, size)
-    total = _together(views)
+    total = together(views)
     pooled = pool(total, normalization=config.normalization, close_radius=config.close_radius, valid=valid)
     empty = int(((pooled.hits <= 0) & valid).sum())
     color = pooled.rgb
@@ -45,7 +45,7 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
     return Observation(color, pooled.confidence, report)
 
 
-def _together(views: Sequence[Sums]) -> Sums:
+def together(views: Sequence[Sums]) -> Sums:
     """Sums of single views -> those of all of them as one, [1,1,C,S,S]."""
     total = Sums(*(part.clone() for part in views[0]))
     for view in views[1:]:

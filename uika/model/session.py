@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from uika.model.features import Keep, ViewFeatures
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
+from uika.model.observation import together
 from uika.model.reconstructor import Reconstructor
 from uika.model.transformer import ContextMemory
+from uika.uv import Sums
 
 
 class Session:
@@ -18,9 +23,20 @@ class Session:
     what they were: an approximation that ends with `refresh`, which runs the transformer over everything again.
     """
 
-    def __init__(self, model: Reconstructor, texel: Tensor, surface: SurfaceTexels, keep: Keep = "foreground") -> None:
-        """Arguments as in `Reconstructor.forward`; the surface belongs to one head, its batch dimension is 1."""
+    def __init__(
+        self,
+        model: Reconstructor,
+        texel: Tensor,
+        surface: SurfaceTexels,
+        keep: Keep = "foreground",
+        prior: Callable[[Sums], Tensor] | None = None,
+    ) -> None:
+        """Arguments as in `Reconstructor.forward`; the surface belongs to one head, its batch dimension is 1.
+
+        `prior` gives the surface's prior anew from the sums [1,1,C,S,S] of all photos.
+        """
         self.model = model
+        self.prior = prior
         self.texel = texel
         self.surface = surface
         self.keep: Keep = keep
@@ -59,4 +75,7 @@ class Session:
         return self._decode(len(self), len(self))
 
     def _decode(self, reused: int, newcomers: int) -> CanonicalGaussians:
-        return self.model.decode([self._views], self.texel, self.surface, self.keep, reused, self._memory, newcomers)
+        surface = self.surface
+        if self.prior is not None:
+            surface = replace(surface, prior=self.prior(together([view.sums for view in self._views])))
+        return self.model.decode([self._views], self.texel, surface, self.keep, reused, self._memory, newcomers)

@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.head_quality import PORTRAIT
+from uika import GrowingAvatar, HeadModel, UikaError, load_head, reconstruct
+from uika.head import HeadParameters
+from uika.photo import PhotoError
+from uika.reconstruction import Report
+from uika.rendering import neutral_camera, render
+from uika.video import write_png
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+@pytest.fixture(scope="module")
+def photos(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The portrait, and its avatar from both sides."""
+    avatar = reconstruct([PORTRAIT], head, "none").avatar
+    params = HeadParameters.zeros(head).replace(identity=avatar.identity)
+    folder, paths = tmp_path_factory.mktemp("photos"), [PORTRAIT]
+    for yaw in (-25.0, 25.0):
+        paths.append(folder / f"{yaw:.0f}.png")
+        write_png(paths[-1], render(avatar, params, neutral_camera(avatar, yaw, 0.0, 512), head).rgb)
+    return paths
+
+
+def test_growing_ends_where_everything_at_once_does(photos: list[Path], head: HeadModel) -> None:
+    growing, whole = GrowingAvatar(head=head), reconstruct(photos, head).avatar
+    first = growing.add(photos[:2])
+    torch.testing.assert_close(first.means, reconstruct(photos[:2], head).avatar.means, rtol=0, atol=1e-5)
+    report = Report()
+    grown = growing.add(photos[2:], report)
+    assert len(growing) == 3
+    assert report.counts["views"] == 3
+    assert report.counts["reused_views"] == 2
+    assert torch.equal(grown.identity, first.identity)
+    assert grown.provenance == whole.provenance
+    assert (grown.colors - first.colors).abs().max() > 0.05  # the new side is seen
+    refreshed = growing.refresh()
+    for name in ("identity", "means", "quats", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(refreshed, name), getattr(whole, name), rtol=0, atol=1e-4)
+
+
+def test_a_photo_that_cannot_be_used_changes_nothing(photos: list[Path], head: HeadModel, tmp_path: Path) -> None:
+    growing = GrowingAvatar(head=head, keep="foreground")
+    with pytest.raises(UikaError, match="no photos yet"):
+        growing.refresh()
+    growing.add(photos[:1])
+    write_png(tmp_path / "grey.png", torch.full((64, 64, 3), 0.5))
+    with pytest.raises(PhotoError, match=r"grey\.png"):
+        growing.add([tmp_path / "grey.png"])
+    assert len(growing) == 1
+    with pytest.raises(UikaError, match="1 to 63 more photos"):
+        growing.add([])
+    with pytest.raises(UikaError, match="none"):
+        GrowingAvatar("none", head)
