@@ -35,6 +35,7 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "posing": ("--repeats", "2"),
     "model_latency": ("--views", "1", "--configurations", "fp32 dense"),
     "model_skipping": ("--views", "1", "--photos", "2", "--repeats", "1"),
+    "model_operations": ("--preset", "tiny", "--views", "1", "2"),
     "tracking": ("--seconds", "1"),
     "fit_accuracy": ("--people", "1", "--refined", "0"),
     "mitsuba_spp": ("--size", "64", "--reference", "64", "--renders", "20"),

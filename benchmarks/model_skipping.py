@@ -51,7 +51,6 @@ class Case:
     avatar: Avatar  # whose Gaussians are replaced
     targets: list[Any]  # of `drive`, or (parameters, camera)
     truths: list[Tensor]  # [S,S,3]
-    background: float = 1.0
     mask: Tensor | None = None  # [S,S] pixels that count
 
     def first(self, count: int, last: int | None = None) -> tuple[Tensor, ...]:
@@ -77,7 +76,7 @@ def around(loaded: LoadedModel, head: HeadModel) -> Case:
     fit = Fit(HeadParameters.stack([params] * AROUND), views.cameras, views.avatar.static_offset, torch.zeros(AROUND))
     inputs = _inputs(loaded, head, fit, views.images[0], views.masks[0, :, 0])
     targets, truth = [(params, views.cameras[AROUND - 1])], views.images[0, -1].permute(1, 2, 0)
-    return Case("portrait from around", inputs, views.avatar, targets, [truth], background=0.0)
+    return Case("portrait from around", inputs, views.avatar, targets, [truth])
 
 
 def people(loaded: LoadedModel, head: HeadModel, folder: Path, most: int, count: int) -> Iterator[Case]:
@@ -164,9 +163,7 @@ def _quality(case: Case, result: CanonicalGaussians, head: HeadModel) -> float:
     if isinstance(case.targets[0], View):
         pictures = drive(avatar, case.targets, head, 1.0)
     else:
-        pictures = [
-            rounded(render(avatar, params, camera, head, [case.background] * 3).rgb) for params, camera in case.targets
-        ]
+        pictures = [rounded(render(avatar, params, camera, head).rgb) for params, camera in case.targets]
     return statistics.fmean(psnr(*pair, case.mask) for pair in zip(pictures, case.truths, strict=True))
 
 

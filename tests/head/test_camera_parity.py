@@ -24,5 +24,17 @@ def test_views_and_pixels() -> None:
     torch.testing.assert_close(camera.position.float(), data["out/camera_center"], rtol=0, atol=1e-6)
     pixels, _ = project(data["in/points"].double().expand(4, -1, -1), camera)
     recorded = data["out/pixel_xy"].double() + 0.5
-    # The recorded matrices are exact to 1e-7; the pixels were computed from them in float32.
-    torch.testing.assert_close(pixels, recorded, rtol=3e-5, atol=0)
+    # Relative to a pixel's distance from the corner: a float32 of 4500 pixels is no finer than 2e-4.
+    assert ((pixels - recorded).norm(dim=-1) / recorded.norm(dim=-1)).max() < 1e-6
+
+
+def test_released_rasterizer_from_its_matrices() -> None:
+    """The recorded pixels come from float32 clip coordinates, whose divisor is a little larger than the depth."""
+    data = load_file(FILE)
+    points = torch.cat([data["in/points"], torch.ones(30, 1)], dim=1)
+    clip = points @ data["out/full_proj"]
+    pixels = ((clip[..., :2] / (clip[..., 3:] + 1e-7) + 1) * torch.tensor([512.0, 384.0]) - 1) / 2
+    torch.testing.assert_close(pixels, data["out/pixel_xy"], rtol=1e-6, atol=0)
+    own = data["out/intrinsics"][:, :3, :3]
+    focal = torch.stack([own[:, 0, 0], own[:, 1, 1]], dim=1)
+    torch.testing.assert_close(torch.tensor([512.0, 384.0]) / focal / 2, data["out/tanfov"], rtol=0, atol=1e-6)
