@@ -47,7 +47,7 @@ LINES = {
 
 # Tests outside of this folder, or without the number in their name.
 ELSEWHERE = {
-    28: ["tests/stress/test_uses.py::test_threads_may_call_at_once"],
+    28: ["tests/stress/test_workers.py::test_threads_may_call_at_once"],
     39: ["tests/photo/test_read.py"],
     40: ["tests/train/test_train.py::test_a_step_that_is_not_finite_is_skipped_and_named"],
 }
