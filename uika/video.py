@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,16 @@ def write_video(
             pending.popleft().result()
         container.mux(stream.encode())
     return count
+
+
+def open_video(path: Path) -> Any:
+    """An opened video (PyAV's container); what is not text in its metadata does not keep it from being read."""
+    import av
+
+    try:
+        return av.open(str(path), metadata_errors="replace")
+    except TypeError:  # newer versions of PyAV replace by themselves
+        return av.open(str(path))
 
 
 def check_even(size: int) -> int:

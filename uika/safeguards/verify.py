@@ -16,6 +16,7 @@ from uika.arrays import ArraysError, read_npz
 from uika.errors import UikaError
 from uika.safeguards.provenance import as_text
 from uika.safeguards.watermark import Detection, detect
+from uika.video import open_video
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm")
@@ -83,7 +84,7 @@ def _video(path: Path) -> Finding:
     import av
 
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             text = container.metadata.get("comment") or container.metadata.get("COMMENT") or ""
             frames = _spread(path, container)
     except UikaError:
