@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from uika.head import Camera, project
+from uika.head import Camera, ellipse, project
 
 FILE = Path(__file__).parents[3] / "shared" / "parity" / "camera.safetensors"
 
@@ -38,3 +38,12 @@ def test_released_rasterizer_from_its_matrices() -> None:
     own = data["out/intrinsics"][:, :3, :3]
     focal = torch.stack([own[:, 0, 0], own[:, 1, 1]], dim=1)
     torch.testing.assert_close(torch.tensor([512.0, 384.0]) / focal / 2, data["out/tanfov"], rtol=0, atol=1e-6)
+
+
+def test_orbit() -> None:
+    recorded = load_file(FILE.with_name("orbit_cameras.safetensors"))
+    cameras = ellipse(int(recorded["in/num_frames"][0]))
+    to_world = torch.linalg.inv(cameras.viewmat.double())
+    torch.testing.assert_close(to_world.float(), recorded["out/c2w"].float(), rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="at least one camera"):
+        ellipse(0)

@@ -2,7 +2,7 @@
 
 from uika.head.atlas import Binding, uv_texels
 from uika.head.binding import pose_gaussians, skin_points, surface_frames, surface_points
-from uika.head.camera import Camera, look_at, orbit, project
+from uika.head.camera import Camera, ellipse, look_at, orbit, project
 from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel, load_head, save_arrays, save_head
 from uika.head.parameters import HeadParameters
 from uika.head.posing import joint_transforms, pose_vertices, rest_joints, rodrigues, shaped_vertices, vertex_normals
@@ -16,6 +16,7 @@ __all__ = [
     "HeadError",
     "HeadModel",
     "HeadParameters",
+    "ellipse",
     "joint_transforms",
     "load_head",
     "look_at",

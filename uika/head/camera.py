@@ -152,3 +152,39 @@ def orbit(
             for phase in phases
         ]
     )
+
+
+def ellipse(
+    count: int,
+    radii: tuple[float, float] = (0.35, 0.8),
+    distance: float = 0.7,
+    *,
+    focal: float = 1000.0,
+    size: int = 512,
+) -> Camera:
+    """The released program's path of `count` cameras: an ellipse in front of the head, each looking at the origin.
+
+    Args:
+        count: number of cameras, from the top towards the subject's left.
+        radii: of the ellipse, upwards and sideways, metres.
+        distance: of its plane from the origin, metres.
+        focal: focal length in pixels.
+        size: image side in pixels.
+
+    Raises:
+        ValueError: `count` is below 1 or `distance` is not positive.
+    """
+    if count < 1 or not distance > 0:
+        raise ValueError(f"ellipse needs at least one camera and distance > 0, got {count} and {distance}")
+    phases = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    height, side = radii[0] * phases.cos(), radii[1] * phases.sin()
+    position = torch.stack((side, height, torch.full_like(side, distance)), dim=-1)
+    forward = torch.nn.functional.normalize(-position, dim=-1)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(forward)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    rotation = torch.stack((right, torch.linalg.cross(forward, right), forward), dim=-2)
+    viewmat = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    viewmat[:, :3, :3] = rotation
+    viewmat[:, :3, 3:] = -rotation @ position[..., None]
+    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]]).repeat(count, 1, 1)
+    return Camera(viewmat.float(), K, size, size)
