@@ -24,6 +24,7 @@ def test_full_size_file_runs_from_one_photo_to_gaussians(tmp_path: Path) -> None
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
+    print({name: value for name, value in figures.items() if name != "sample"})
     assert figures["gaussians"] == VALID
     assert figures["finite"]
     assert figures["spread"] > 1e-3
