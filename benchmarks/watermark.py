@@ -153,7 +153,13 @@ def _timed(picture: Picture) -> float:
 def _text(result: dict[str, Any]) -> str:
     names = list(dict.fromkeys(key for row in result["rows"] for key in row))
     rows = [{name: row.get(name, "") for name in names} for row in result["rows"]]
-    return "\n".join(f"{key}: {value}\n" for key, value in result.items() if key != "rows") + "\n" + markdown(rows)
+    cost, grey = result["PSNR of rendered frames, dB"], result["PSNR of a grey picture, dB"]
+    spent = result["milliseconds for a 512x512 frame"]
+    about = (
+        f"Found from a score of {result['threshold']}. Cost: {cost['mean']} dB PSNR on rendered frames, at least "
+        f"{cost['least']} dB, and\n{grey} dB on an even grey; {spent} ms for a frame of 512 x 512."
+    )
+    return f"{about}\n\n{markdown(rows)}"
 
 
 if __name__ == "__main__":

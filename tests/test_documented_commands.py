@@ -104,7 +104,7 @@ def test_command_runs(command: str, folder: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [command for command in RUN if _long(command)])
-def test_long_command_starts(command: str, folder: Path) -> None:
+def test_long_command_starts(command: str, folder: Path, tmp_path: Path) -> None:
     if "--model " in command or "--video 0" in command:
         pytest.skip("needs a trained model" if "--model " in command else "needs a camera")
     if "--data held_out" in command and not (folder / "held_out").exists():
@@ -113,7 +113,7 @@ def test_long_command_starts(command: str, folder: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     arguments = [sys.executable, "-m", *shlex.split(command)]
     if command.startswith("uika synthesize"):
-        arguments[arguments.index("-o") + 1] = "stopped"  # what others read is whole
+        arguments[arguments.index("-o") + 1] = str(tmp_path)  # what others read is whole
     process = subprocess.Popen(
         arguments, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
