@@ -28,6 +28,7 @@ _FOV = 20.0  # degrees
 _PRESETS = {"Front": (0.0, 0.0), "Left": (60.0, 0.0), "Right": (-60.0, 0.0), "Above": (0.0, 50.0), "Back": (180.0, 0.0)}
 _STILL = 512  # pixels, the height of a still
 _IDLE = 0.005  # seconds between two looks at the controls
+_PACE = 1 / 30  # seconds from one update to the next, at least: a browser takes all that come, and may drown in them
 
 
 class Viewer:
@@ -158,9 +159,10 @@ class Viewer:
     def _work(self) -> None:
         """Everything that poses or renders, in one thread: the newest state of the controls wins."""
         while not self._stopped.is_set():
+            start = time.perf_counter()
             try:
-                if not self._step():
-                    time.sleep(_IDLE)
+                changed = self._step()
+                time.sleep(max(_IDLE, _PACE - (time.perf_counter() - start)) if changed else _IDLE)
             except Exception as error:  # the page goes on, and says what it could not do
                 self._status.content = f"**{type(error).__name__}**: {error}"
 
