@@ -18,6 +18,7 @@ from uika import Avatar, UikaError, get_motion, load_head
 from uika.cli import main
 from uika.safeguards import verify
 from uika.viewer import Viewer
+from uika.viewer.painting import BROWSER, HERE
 from uika.viewer.sending import KINDS
 
 pytest.importorskip("viser", reason="no viser: install the extra 'view'")
@@ -86,6 +87,22 @@ def test_jaw_slider_changes_the_picture(avatar, tmp_path):
             assert changed.mean() > 0.01
             assert share[len(share) // 2 :].sum() > 3 * share[: len(share) // 2].sum()  # the jaw, not the skull
             _no_errors(tab)
+
+
+@pytest.mark.slow
+def test_pictures_drawn_here_follow_the_sliders(avatar, tmp_path):
+    with Viewer(avatar, load_head(), port=8199) as viewer, page(tmp_path, 900, 700) as tab:
+        drawn = _open(tab, viewer)
+        _choose(tab, BROWSER, HERE)
+        time.sleep(1.0)
+        painted = _settled(tab)
+        assert np.abs(painted - drawn).mean() < 6  # the same head at the same place
+        sent = viewer.updates
+        tab.run("document.querySelector('[role=slider]').focus()")
+        tab.key("End", 35)
+        _updated(viewer, tab, sent)
+        assert (np.abs(_settled(tab) - painted).sum(-1) > 60).mean() > 0.01
+        _no_errors(tab)
 
 
 @pytest.mark.slow

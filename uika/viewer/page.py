@@ -20,6 +20,7 @@ from uika.safeguards import mark
 from uika.video import to_bytes
 from uika.viewer.camera import CameraFace
 from uika.viewer.live import UNITS, LiveSplats
+from uika.viewer.painting import Painting
 from uika.viewer.panels import IdentityPanel, MotionPanel, PosePanel
 from uika.viewer.sending import KINDS, exported
 from uika.viewer.still import camera_of, compare
@@ -120,6 +121,7 @@ class Viewer:
         self._identity = IdentityPanel(gui, avatar.identity, self._reshaped.set)
         self._playing = MotionPanel(gui, self._motion, self._camera, self._dirty.set)
         with gui.add_folder("Display"):
+            self._painting = Painting(gui, self.server, self._splats, self._watermark, self._dirty.set)
             colors: Any = gui.add_dropdown("colours", ("photo", "UV"))
             colors.on_update(lambda _: self._jobs.put(lambda: self.live.paint(colors.value)))
             mesh = gui.add_checkbox("mesh", False)
@@ -183,8 +185,12 @@ class Viewer:
             return False
         self._dirty.clear()
         self._params = self._wanted() if filmed is None else filmed
-        buffer, vertices = self.live.pose(self._params)
-        self._splats.buffer = buffer
+        if self._painting.here:
+            self._painting.show(self.live, self._params)
+        if not self._painting.here or self._mesh is not None:
+            buffer, vertices = self.live.pose(self._params)
+        if not self._painting.here:
+            self._splats.buffer = buffer
         if self._mesh is not None:
             self._mesh.vertices = vertices
         self.updates += 1
