@@ -43,11 +43,19 @@ def worst(request: pytest.FixtureRequest) -> Worst:
     return keep
 
 
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Note how each case of each test ended."""
-    if report.when == "call" or report.outcome != "passed":
-        case = report.nodeid[len(_name(report.nodeid)) :].strip("[]")
-        _CASES.setdefault(_name(report.nodeid), {})[case] = report.outcome
+class Recorder:
+    """Notes how each case of each test ended, outside of this folder too."""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Called by pytest for every phase of every test."""
+        if report.when == "call" or report.outcome != "passed":
+            case = report.nodeid[len(_name(report.nodeid)) :].strip("[]")
+            _CASES.setdefault(_name(report.nodeid), {})[case] = report.outcome
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hooks of a conftest see the tests of its folder only; those of a plugin see all."""
+    config.pluginmanager.register(Recorder())
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
