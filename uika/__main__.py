@@ -1,7 +1,5 @@
 """`python -m uika`."""
 
-import sys
+from uika.cli import run
 
-from uika.cli import main
-
-sys.exit(main())
+run()

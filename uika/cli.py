@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import sys
+import threading
+import time
 import traceback
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 # Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -16,6 +20,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from uika.errors import UikaError, install_command
 
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
+_PATIENCE = 1.5  # seconds from an interrupt to the end
+_said = threading.Event()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
-        print("\ninterrupted", file=sys.stderr)
+        _say_interrupted()
         return _INTERRUPTED
     except Exception as error:
         if debug:
@@ -47,6 +53,48 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = "" if code == _WRONG_INPUT or debug else " (--debug shows where)"
         print(f"uika: {sentence}{hint}", file=sys.stderr)
         return code
+
+
+def run() -> NoReturn:
+    """Run one command as the process, and end the process with its exit code; an interrupt ends it within seconds."""
+    _watch_for_interrupts()
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if code == _INTERRUPTED:
+        _end()
+    sys.exit(code)
+
+
+def _say_interrupted() -> None:
+    if not _said.is_set():
+        _said.set()
+        print("\ninterrupted", file=sys.stderr, flush=True)
+
+
+def _end() -> NoReturn:
+    """Leave at once: threads and processes of loaders would be waited for, or abort this one."""
+    for child in multiprocessing.active_children():
+        child.kill()
+    os._exit(_INTERRUPTED)
+
+
+def _watch_for_interrupts() -> None:
+    """Python answers a signal when the operator at hand returns, which may take long: do not wait for more than that."""
+    # The tracker of shared memory tidies up behind a process that left at once, and need not say so.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while received := os.read(reader, 1):
+            if received[0] == signal.SIGINT:
+                time.sleep(_PATIENCE)
+                _say_interrupted()
+                _end()
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _choose_head(arguments: list[str]) -> list[str]:

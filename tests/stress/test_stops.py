@@ -112,7 +112,9 @@ def test_stopped_at_a_random_moment(
             if kind == signal.SIGINT:
                 assert ended < 2.0 * max(1, os.getloadavg()[0] / (os.cpu_count() or 1))
                 assert "Traceback" not in error and error.endswith("interrupted\n"), error
-                assert not [path for path in (tmp_path / "out").rglob(".*") if path.is_file()]
+                assert process.returncode == 130
+                if ended < 1.4:  # or the process did not wait for an operator that took longer, nor clean up behind it
+                    assert not [path for path in (tmp_path / "out").rglob(".*") if path.is_file()]
         else:
             process.communicate()
         check_whole(tmp_path / "out")
