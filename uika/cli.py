@@ -36,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
+    _said.clear()
     try:
         arguments = _choose_head([argument for argument in arguments if argument != "--debug"])
         if arguments in ([], ["-h"], ["--help"]):
@@ -80,7 +81,7 @@ def _end() -> NoReturn:
 
 
 def _watch_for_interrupts() -> None:
-    """Python answers a signal when the operator at hand returns, which may take long: do not wait for more than that."""
+    """Python answers a signal when the operator at hand returns: end the process if that takes too long."""
     # The tracker of shared memory tidies up behind a process that left at once, and need not say so.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     reader, writer = os.pipe()
