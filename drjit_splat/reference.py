@@ -15,6 +15,7 @@ from torch import Tensor
 from . import constants as c
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
+from ._rotations import quats_to_rotations
 from ._settings import Options, Settings
 
 
@@ -41,21 +42,6 @@ class Projection:
     margin: Tensor  # [N] relative distance of the closest of these decisions to its threshold (not that of `inria`)
     radii: Tensor  # [N, 2] pixels, integer, zero where culled
     span: Tensor  # [N, 2, 2] first pixel and one past the last, in x and in y, that the rules allow
-
-
-def quats_to_rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of wxyz quaternions [N, 4] of any length; too short ones give the identity."""
-    squared = (quats * quats).sum(-1, keepdim=True)
-    short = squared < c.QUAT_MIN_NORM**2
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
-    unit = torch.where(short, identity, quats / torch.where(short, torch.ones_like(squared), squared).sqrt())
-    w, x, y, z = unit.unbind(-1)
-    rows = (
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    )
-    return torch.stack(rows, -2)
 
 
 def _root(splats: Splats) -> Tensor:
