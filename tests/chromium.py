@@ -22,6 +22,10 @@ _FLAGS = (
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
+    # A page that nobody looks at would be drawn rarely, and its process would come last.
+    "--disable-backgrounding-occluded-windows",
+    "--disable-background-timer-throttling",
+    "--disable-renderer-backgrounding",
     "--disable-component-update",
     "--disable-sync",
     "--disable-dev-shm-usage",
@@ -126,6 +130,8 @@ def page(folder: Path, width: int = 900, height: int = 700) -> Iterator[Page]:
             tab = Page(socket)
             for domain in ("Page", "Runtime", "Log", "Network"):
                 tab.call(f"{domain}.enable")
+            tab.call("Page.bringToFront")
+            tab.call("Emulation.setFocusEmulationEnabled", enabled=True)
             size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
             tab.call("Emulation.setDeviceMetricsOverride", **size)
             yield tab

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from uika.head import HeadParameters
 from uika.safeguards import mark
 from uika.viewer.live import LiveSplats
@@ -44,7 +46,9 @@ class Painting:
 
     def _switch(self) -> None:
         self._splats.visible = not self.here
-        if not self.here:
+        if self.here:
+            self._splats.buffer = np.zeros((1, 8), np.uint32)  # hidden ones would still be looked at for every picture
+        else:
             for client in self._server.get_clients().values():
                 client.scene.set_background_image(None)
         self._moved()
