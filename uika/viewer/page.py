@@ -238,4 +238,4 @@ class Viewer:
         view = (camera.wxyz, camera.position, camera.fov)
         seen = camera_of(view, round(_STILL * camera.aspect), _STILL)
         made = exported(kind, self.live.avatar, self._head, self._params, self._motion, seen, self._watermark)
-        client.send_file_download(f"avatar{kind}", made)
+        client.send_file_download(f"avatar{kind}", made, save_immediately=True)
