@@ -2,12 +2,14 @@
 
 Every configuration runs the same weights on the same views of the bundled portrait's avatar. Weights are random unless
 `--model` names a trained file: speed does not depend on them, errors do. Stages are timed inside one run of the whole;
-processor seconds tell more than wall seconds when the machine is shared.
+processor seconds tell more than wall seconds when the machine is shared. The paper's size takes hours: `--kept FOLDER`
+keeps every finished row there, and a second call goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import platform
@@ -19,11 +21,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 from torch import nn
 
 from benchmarks.figures import lines
 from benchmarks.model_inputs import Views, make_views
 from benchmarks.rasterizer_common import save
+from uika.files import write_tensors
 from uika.head import HeadParameters
 from uika.metrics import psnr
 from uika.model import (
@@ -58,20 +62,67 @@ class Figures:
     skipped_patches: float = math.nan
 
 
+class Kept:
+    """Finished rows and the Gaussians that later ones are compared with, in a folder or, without one, in memory."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """Read what a folder has; it is made when needed."""
+        self._folder = folder
+        self._references: dict[int, list[torch.Tensor]] = {}
+        self.rows: list[Figures] = []
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            if self._file.exists():
+                self.rows = [Figures(**json.loads(line)) for line in self._file.read_text().splitlines()]
+
+    @property
+    def _file(self) -> Path:
+        return (self._folder or Path()) / "rows.jsonl"
+
+    def has(self, count: int, name: str) -> bool:
+        """Whether a row is finished."""
+        return any((row.views, row.configuration) == (count, name) for row in self.rows)
+
+    def add(self, row: Figures) -> None:
+        """Keep a row."""
+        self.rows.append(row)
+        if self._folder is not None:
+            with self._file.open("a") as file:
+                file.write(json.dumps(asdict(row)) + "\n")
+
+    def reference(self, count: int, result: CanonicalGaussians) -> list[torch.Tensor]:
+        """The five tensors that results with `count` views are compared with: the first that was given."""
+        path = None if self._folder is None else self._folder / f"{count}.safetensors"
+        if count not in self._references and path is not None and path.exists():
+            self._references[count] = list(load_file(path).values())
+        if count not in self._references:
+            self._references[count] = [part.float().contiguous() for part in result]
+            if path is not None:
+                write_tensors(path, {str(i): part for i, part in enumerate(self._references[count])}, {})
+        return self._references[count]
+
+
 def run(
-    model: Reconstructor, estimator: Estimator | None, views: Views, counts: Sequence[int], wanted: Sequence[str]
+    model: Reconstructor,
+    estimator: Estimator | None,
+    views: Views,
+    counts: Sequence[int],
+    wanted: Sequence[str],
+    kept: Kept,
 ) -> Iterator[Figures]:
     """Measure every wanted configuration at every number of views; dense float32 comes first and is the reference."""
     halved = {"bf16 dense", "bf16 foreground"}
-    references: dict[int, CanonicalGaussians] = {}
     for half in (False, True):
         names = [name for name in CONFIGURATIONS if name in wanted and (name in halved) == half]
         if half and names:
             model.halve()
         for count in counts:
             for name in names:
+                if kept.has(count, name):
+                    continue
                 figures, result = _measure(model, estimator, views, count, name)
-                _compare(figures, result, references.setdefault(count, result), views)
+                _compare(figures, list(result), kept.reference(count, result), views)
+                kept.add(figures)
                 yield figures
 
 
@@ -139,15 +190,15 @@ def _timed(model: Reconstructor, estimator: Estimator | None, figures: Figures) 
         handle.remove()
 
 
-def _compare(figures: Figures, result: CanonicalGaussians, reference: CanonicalGaussians, views: Views) -> None:
-    figures.means_mm = 1e3 * (result.means - reference.means).norm(dim=-1).mean().item()
-    figures.colors = (result.colors - reference.colors).abs().mean().item()
+def _compare(figures: Figures, result: Sequence[torch.Tensor], reference: Sequence[torch.Tensor], views: Views) -> None:
+    figures.means_mm = 1e3 * (result[0] - reference[0]).norm(dim=-1).mean().item()
+    figures.colors = (result[4] - reference[4]).abs().mean().item()
     picture, expected = (_picture(each, views) for each in (result, reference))
     figures.render_psnr = psnr(picture, expected)
     figures.photo_psnr = psnr(picture, views.images[0, 0].permute(1, 2, 0))
 
 
-def _picture(result: CanonicalGaussians, views: Views) -> torch.Tensor:
+def _picture(result: Sequence[torch.Tensor], views: Views) -> torch.Tensor:
     means, quats, scales, opacities, colors = (part[0].float().contiguous() for part in result)
     avatar = replace(
         views.avatar, means=means, quats=quats, scales=scales, opacities=opacities, colors=colors.clamp(0, 1)
@@ -213,6 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--configurations", nargs="+", default=list(CONFIGURATIONS), choices=CONFIGURATIONS)
     parser.add_argument("--estimator", action="store_true", help="run the correspondence estimator too")
     parser.add_argument("--name", default="model_latency", help="of the result files")
+    parser.add_argument("--kept", type=Path, help="folder for finished rows, of this preset and machine alone")
     arguments = parser.parse_args(argv)
     wanted = [CONFIGURATIONS[0], *(name for name in arguments.configurations if name != CONFIGURATIONS[0])]
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__},", end=" ")
@@ -224,11 +276,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.preset != "paper":
         with torch.no_grad():
             warm()
-    rows = []
-    for row in run(model, estimator, views, arguments.views, wanted):
-        rows.append(row)
+    kept = Kept(arguments.kept)
+    for row in run(model, estimator, views, arguments.views, wanted, kept):
         print(table([row]).splitlines()[-1], flush=True)
-    rows.sort(key=lambda row: (row.views, CONFIGURATIONS.index(row.configuration)))
+    rows = sorted(kept.rows, key=lambda row: (row.views, CONFIGURATIONS.index(row.configuration)))
     text = f"`{arguments.model or arguments.preset}`; stages in processor seconds.\n\n{table(rows)}"
     save(arguments.name, "Network: time, memory and error", text, {"rows": [asdict(row) for row in rows]})
     curves = {name: [(row.views, row.cpu_s) for row in rows if row.configuration == name] for name in CONFIGURATIONS}

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict, dataclass
 
 TURNED_AWAY = 0.25  # cosine between face and camera below which a source would not show the face
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Protocol:
         """The choices in words, to be printed with the numbers."""
         setting = {
             "mono": "source and target frames of one camera, the most frontal one",
-            "multi": "source and target frames of all cameras that see the face",
+            "multi": "source and target frames of all cameras that see the face at first",
         }[self.setting]
         task = {
             "self": "targets are held-out frames of the same person",
@@ -83,7 +83,8 @@ class Protocol:
             "": "pictures of another system",
         }[self.correspondence]
         sentences = [
-            f"data {self.data}: {setting}; {task}; at most {self.targets} targets for each sequence",
+            f"data {self.data}: {setting}, sources turned to the camera; {task}; "
+            f"at most {self.targets} targets for each sequence",
             f"{self.method}: {self.model}; {how}",
             f"crop: the whole frame, padded to a square, {self.size}x{self.size} pixels; "
             f"background: grey {self.background:g} in truth and result, cut out with the truth's mask",

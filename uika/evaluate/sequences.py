@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from uika.data import Capture, DataError, Sample
 from uika.evaluate.protocol import TURNED_AWAY
 from uika.head import HeadModel, rodrigues
+from uika.reconstruction import MAX_PHOTOS
 from uika.train.people import Person, open_person
 
 Place = tuple[int, str]  # time step and camera
@@ -38,8 +40,9 @@ def choose_frames(path: Path, setting: str, targets: int, head: HeadModel) -> Se
     """Open a sequence and choose its frames.
 
     Every other time step is held out for targets (with a single step: every other camera). Mono uses the most frontal
-    camera, multi all that see the face at the first step. Sources come in an order in which each is as far as possible
-    from those before, so that the sources of fewer views are among those of more.
+    camera, multi all that see the face at the first step; frames in which a head has turned away from its camera are no
+    sources. Sources come in an order in which each is as far as possible from those before, so that the sources of
+    fewer views are among those of more.
 
     Raises:
         DataError: the sequence cannot be used, or has too few frames.
@@ -63,7 +66,9 @@ def choose_frames(path: Path, setting: str, targets: int, head: HeadModel) -> Se
         pools = (steps[::2], cameras), (steps[1::2], cameras)
     else:
         pools = (steps, cameras[::2]), (steps, cameras[1::2])
-    sources, held = ([at for at in _round_robin(*pool) if at in place] for pool in pools)
+    order, held = ([at for at in _round_robin(*pool) if at in place] for pool in pools)
+    shown = (at for at in order if facing(check_sample(person.sample(place[at]), head)) > TURNED_AWAY)
+    sources = list(islice(shown, MAX_PHOTOS))
     if not sources or not held:
         raise DataError(f"{path}: has {len(steps)} time steps and {len(cameras)} cameras, too few to hold frames out")
     identity = next(iter(opening.values())).identity
@@ -79,8 +84,8 @@ def choose_frames(path: Path, setting: str, targets: int, head: HeadModel) -> Se
     )
 
 
-def check_sample(sample: Sample, head: HeadModel) -> None:
-    """Make sure that a sample has parameters of this head model.
+def check_sample(sample: Sample, head: HeadModel) -> Sample:
+    """The sample, if it has parameters of this head model.
 
     Raises:
         DataError: it has none, or they are another model's.
@@ -92,6 +97,7 @@ def check_sample(sample: Sample, head: HeadModel) -> None:
     found = len(sample.parameters.identity), len(sample.parameters.expression), offset
     if found != sizes:
         raise DataError(f"{sample.key}: made for another head model (identities, expressions, vertices: {found})")
+    return sample
 
 
 def facing(sample: Sample) -> float:
