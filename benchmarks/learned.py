@@ -124,6 +124,13 @@ def rows_of(
     targets = target_views(frames.targets, protocol, head)
     truths = Pictures.of([truth_picture(view, 1.0) for view in targets])
     masks = [view.mask >= 0.5 for view in targets]
+
+    def scored(avatar: Avatar) -> dict[str, float | None]:
+        results = Pictures.of(drive(avatar, targets, head, 1.0), truths)
+        scores = score(results, truths, masks, Pictures.of([]), protocol, judges)
+        return {name: mean(scores[name]) for name in METRICS}
+
+    nobody = scored(average)
     for count in views:
         if count > len(frames.sources):
             continue
@@ -132,15 +139,14 @@ def rows_of(
         unseen: dict[str, Any] = {}
         if how == "exact":
             unseen = unseen_texels(frames, count, avatars, head, models["trained"].network.config.map_size)
-        for method, avatar in {"mean head": average, **avatars}.items():
-            results = Pictures.of(drive(avatar, targets, head, 1.0))
-            scores = score(results, truths, masks, Pictures.of([]), protocol, judges)
+        every = {"mean head": nobody, **{name: scored(avatar) for name, avatar in avatars.items()}}
+        for method, scores in every.items():
             yield {
                 "person": frames.name,
                 "correspondence": how,
                 "views": count,
                 "method": method,
-                **{name: mean(scores[name]) for name in METRICS},
+                **scores,
                 "unseen": unseen if method == "trained" else {},
             }
 

@@ -47,3 +47,13 @@ def test_a_quick_run_writes_everything(tmp_path: Path) -> None:
         [sys.executable, "-m", "benchmarks", "--quick", "rasterizer_skips"], capture_output=True, text=True, check=True
     )
     assert "rasterizer_skips ..." in done.stdout
+
+
+@pytest.mark.slow
+def test_the_network_is_timed_and_rows_are_kept(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "uika", "bench", "model", "--views", "1", "-o", str(tmp_path)]
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = (tmp_path / "tiny" / "rows.jsonl").read_bytes()
+    assert rows.count(b"\n") == 5 and {path.suffix for path in tmp_path.glob("model_latency.*")} >= {".md", ".json"}
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (tmp_path / "tiny" / "rows.jsonl").read_bytes() == rows

@@ -22,6 +22,7 @@ from uika.head import (
 from uika.model import SurfaceTexels
 
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
+SEAM = 1.4  # enlarges splats at the edge of a chart, whose neighbours beyond the seam are moved apart from them
 FLATNESS = 0.1  # standard deviation along the normal over the mean tangential one
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
 _CURVATURE, _MAX_LIFT = 0.75, 4e-3  # share of the full tangent-plane lift, and its limit in metres
@@ -51,10 +52,19 @@ def surface_texels(
     vertices = shaped_vertices(head, neutral, static_offset)
     points = _curved(vertices, head.faces, binding, surface_points(vertices, head.faces, binding))
     frames, sides = _texel_frames(head, vertices, binding, points)
+    sides = torch.where(_at_seam(binding)[:, None], SEAM * sides, sides)
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
     quats = _quaternions(frames)
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
-    return replace(surface, lift=_lift(head, neutral, static_offset, binding)), binding
+    deviation = (vertices - head.template)[head.faces[binding.triangle]] * binding.barycentric[..., None]
+    shape = binding.to_map(deviation.sum(1))
+    return replace(surface, lift=_lift(head, neutral, static_offset, binding), shape=shape), binding
+
+
+def _at_seam(binding: Binding) -> Tensor:
+    """Which of the M texels have a neighbour outside the atlas."""
+    outside = (~binding.valid).float()[None, None]
+    return binding.from_map(torch.nn.functional.max_pool2d(outside, 3, 1, 1)[0])[:, 0] > 0
 
 
 def _lift(head: HeadModel, neutral: HeadParameters, static_offset: Tensor, binding: Binding) -> Tensor:

@@ -74,10 +74,10 @@ class Train:
             config = replace(config, images=3 * config.images, items=2 * config.items)
         config = replace(config, **given)
         if self.overfit:
-            # The same pictures at every step and full speed soon: this is to show that gradients arrive.
-            config = replace(
-                config, augment=False, fitted=0.0, warmup=min(20, config.warmup), ema=0.0, weight_decay=0.0
-            )
+            # The same pictures at every step, which alone count, and full speed soon: this shows that gradients arrive.
+            losses = replace(config.losses, atlas=0.0, relief=0.0)
+            config = replace(config, augment=False, fitted=0.0, losses=losses, ema=0.0, weight_decay=0.0)
+            config = replace(config, warmup=min(20, config.warmup))
         if "steps" in given:
             config = replace(config, warmup=min(config.warmup, max(1, config.steps // 10)))
         if self.part == "reconstructor":

@@ -85,3 +85,15 @@ def test_frames_are_the_captures(capture: Path) -> None:
         sample = opened.sample(index)
         assert f"{sample.timestep:05d}_{sample.camera_id}" == name
         assert np.isfinite(facing(sample))
+
+
+def test_a_head_that_turned_away_is_no_source(capture: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(capture, tmp_path / "turned")
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    (file,) = {folder / frame["flame_param_path"] for frame in frames if frame["timestep_index"] == 2}
+    with np.load(file) as arrays:
+        turned = {**arrays, "rotation": np.asarray([[0.0, np.pi, 0.0]], dtype=np.float32)}
+    np.savez(file, **turned)
+    chosen = choose_frames(folder, "multi", 3, load_head())
+    assert {name[:5] for name in chosen.source_names} == {"00000"}
+    assert len(chosen.source_names) == 4 and len(chosen.target_names) == 3

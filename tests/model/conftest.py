@@ -46,6 +46,7 @@ def make_inputs() -> Callable[..., Inputs]:
             scales=0.001 + 0.002 * torch.rand(1, count, 3, generator=generator),
             mirror=torch.arange(map_size**2).reshape(map_size, map_size).flip(1),
             lift=0.05 * torch.rand(1, map_size, map_size, generator=generator),
+            shape=0.02 * torch.randn(3, map_size, map_size, generator=generator),
         )
         return {
             "images": torch.rand(batch, views, 3, side, side, generator=generator),

@@ -207,8 +207,10 @@ def test_a_model_that_reads_the_surface_needs_it_and_uses_it(small: ModelConfig,
     model = perturb(build(dataclasses.replace(small, surface=True)))
     inputs = make_inputs(views=1, map_size=small.map_size)
     first = model(**inputs)
-    inputs["surface"] = dataclasses.replace(inputs["surface"], lift=inputs["surface"].lift + 0.05)
-    assert (model(**inputs).means - first.means).abs().max() > 1e-6
-    inputs["surface"] = dataclasses.replace(inputs["surface"], lift=None)
-    with pytest.raises(ValueError, match=r"surface\.lift"):
-        model(**inputs)
+    whole = inputs["surface"]
+    for name in ("lift", "shape"):
+        inputs["surface"] = dataclasses.replace(whole, **{name: getattr(whole, name) + 0.05})
+        assert (model(**inputs).means - first.means).abs().max() > 1e-6
+        inputs["surface"] = dataclasses.replace(whole, **{name: None})
+        with pytest.raises(ValueError, match=rf"surface\.{name}"):
+            model(**inputs)

@@ -197,7 +197,8 @@ class _Run:
         else:
             avatar, seconds = self._made(sequence, views, plan.settings.correspondence)
             images = drive(avatar, truth.views, judges.head, protocol.background)
-        results = Pictures.of(images)
+        # Between two people a result's face counts without one in the truth.
+        results = Pictures.of(images, None if judges.arcface is not None else truth.pictures)
         shown = truth_picture(View(sequence.person.sample(sequence.sources[0]), protocol.size), protocol.background)
         person = Pictures.of([shown] if judges.arcface is not None and protocol.task == "cross" else [])
         return Result(

@@ -28,9 +28,11 @@ class Pictures:
     landmarks: list[Tensor | None]
 
     @staticmethod
-    def of(images: Sequence[Tensor]) -> Pictures:
-        """Look for the faces."""
-        return Pictures(list(images), [find_landmarks(image) for image in images])
+    def of(images: Sequence[Tensor], like: Pictures | None = None) -> Pictures:
+        """Look for the faces; given the pictures `like` which they should be, only where those have one."""
+        wanted = [True] * len(images) if like is None else [marks is not None for marks in like.landmarks]
+        marks = [find_landmarks(image) if look else None for image, look in zip(images, wanted, strict=True)]
+        return Pictures(list(images), marks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,7 @@ class GaussianConfig:
     fusion_bias    initial logit of the fusion weight where nothing was seen; predicted colours then start as the
                    completed observation. None leaves the colour layer at the default random initialisation
     fusion_trust   how much that logit falls, at the start, as confidence goes from 0 to 1
+    least_scale    smallest ratio of a scale to the texel size (relative only), lest coarse training atlases teach holes
     """
 
     relative: bool
@@ -62,6 +63,7 @@ class GaussianConfig:
     init_opacity: float = 0.1
     fusion_bias: float | None = None
     fusion_trust: float = 0.0
+    least_scale: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,10 @@ class ModelConfig:
     uv_attention      ablation: False drops the UV branch, tokens attend to screen features only
     aggregation       ablation: False hides the aggregate from the decoder and takes predicted colours alone
     surface           True shows the decoder how far the fitted surface stands off the bald head, which tells hair from
-                      skin where no photo does; not in the paper, whose surface is the same for everybody
+                      skin where no photo does, and off the mean head; not in the paper, whose surface is the same for
+                      everybody
+    palette           number of colours, each a weighted mean of what the photos show, that a predicted colour may be
+                      mixed from; 0 for none; not in the paper
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
     """
 
@@ -120,6 +125,7 @@ class ModelConfig:
     uv_attention: bool = True
     aggregation: bool = True
     surface: bool = False
+    palette: int = 0
     fusion: Literal["learned", "fixed"] = "learned"
 
     def __post_init__(self) -> None:
@@ -136,6 +142,8 @@ class ModelConfig:
             (max(self.outputs) == self.layers, "the last of outputs must be layers"),
             (self.token_grid % 2 == 0, "token_grid must be even"),
             (self.fusion in ("learned", "fixed"), 'fusion must be "learned" or "fixed"'),
+            (0 <= self.palette <= 64, "palette must lie in 0..64"),
+            (0 <= self.gaussians.least_scale <= 1, "gaussians.least_scale must lie in [0,1]"),
             (self.uv.full_trust > 0, "uv.full_trust must be positive"),
             (0 < self.gaussians.init_opacity < 1, "gaussians.init_opacity must lie strictly between 0 and 1"),
         ]
@@ -189,8 +197,9 @@ PRESETS: dict[str, ModelConfig] = {
         dpt_features=48,
         mlp_width=64,
         uv=UvConfig(),
-        gaussians=_SURFACE,
+        gaussians=dataclasses.replace(_SURFACE, least_scale=0.75),
         surface=True,
+        palette=8,
     ),
     "base": ModelConfig(
         name="base",

@@ -82,9 +82,9 @@ class UvDpt(nn.Module):
     """Tokens of four depths and the aggregate -> features at four times the token grid."""
 
     def __init__(self, config: ModelConfig) -> None:
-        """Without `config.aggregation` the aggregate is absent; `config.surface` adds a channel."""
+        """Without `config.aggregation` the aggregate is absent; `config.surface` adds four channels."""
         super().__init__()
-        observed = 4 * config.aggregation + config.surface
+        observed = 4 * config.aggregation + 4 * config.surface
         features, channels = config.dpt_features, config.dpt_projections
         self.grid = config.token_grid
         self.observed = observed

@@ -20,6 +20,7 @@ class SurfaceTexels:
             none; None if unknown
     regions [S,S] int64 labels of parts whose colours do not mix (skin, eyeballs, teeth), or None
     lift    [1,S,S] metres by which hair stands off the bald head, 0 elsewhere, or None
+    shape   [3,S,S] metres from the mean bald head to the surface, 0 elsewhere, or None
     prior   [3,S,S] colours for texels that neither a photo nor its mirror image shows, NaN where there is none, or None
     """
 
@@ -30,6 +31,7 @@ class SurfaceTexels:
     regions: Tensor | None = None
     prior: Tensor | None = None
     lift: Tensor | None = None
+    shape: Tensor | None = None
 
     def rows(self, first: int, last: int) -> SurfaceTexels:
         """The texels from `first` to before `last`; the maps stay whole."""

@@ -12,13 +12,13 @@ from uika.model.dpt import UvDpt, resize
 from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
-from uika.model.heads import AttributeHeads, Attributes, TexelMlp
+from uika.model.heads import AttributeHeads, Attributes, Palette, TexelMlp
 from uika.model.observation import Observation, observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
-_LIFT_UNIT = 10.0  # channel value of a metre of hair
+_LIFT_UNIT, _SHAPE_UNIT = 10.0, 30.0  # channel values of a metre of hair, of a metre off the mean head
 _TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
 
 
@@ -33,22 +33,26 @@ class GaussianDecoder(nn.Module):
         self.dpt_decoder = UvDpt(config)
         self.mlp_net = TexelMlp(config.dpt_features, config.mlp_width)
         self.gs_net = AttributeHeads(config)
+        if self.gs_net.palette:
+            self.palette = Palette(config.dpt_features, config.palette)
 
     def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
         """Tokens of four depths, observed [B,4,S,S], texel [M]."""
         maps = [observed] if self.aggregation else []
-        if self.surface and surface.lift is not None:
-            maps.append(_LIFT_UNIT * surface.lift.to(observed.dtype).expand(len(observed), 1, -1, -1))
+        if self.surface and surface.lift is not None and surface.shape is not None:
+            stand = torch.cat((_LIFT_UNIT * surface.lift, _SHAPE_UNIT * surface.shape))
+            maps.append(stand.to(observed.dtype).expand(len(observed), -1, -1, -1))
         seen_maps = torch.cat(maps, dim=1) if maps else observed
         features = resize(self.dpt_decoder(tokens, seen_maps), (self.map_size, self.map_size))
         features, seen = _gather(features, texel), _gather(observed, texel)
         # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
         with torch.autocast(features.device.type, enabled=False):
             parts = []
+            palette = self.palette(features.to(seen.dtype), seen) if self.gs_net.palette else None
             for first in range(0, max(len(texel), 1), _TEXELS):
                 rows = slice(first, first + _TEXELS)
                 inner = self.mlp_net(features[:, rows].to(seen.dtype))
-                parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS)))
+                parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS), palette))
         return Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
 
 
@@ -71,7 +75,8 @@ class Reconstructor(nn.Module):
 
     def halve(self) -> None:
         """Store the weights in bfloat16 and compute in it where the device can; the per-texel MLP stays float32."""
-        halve(self, exempt=(self.gs_decoder.mlp_net, self.gs_decoder.gs_net))
+        exempt = [part for part in self.gs_decoder.children() if part is not self.gs_decoder.dpt_decoder]
+        halve(self, exempt=exempt)
         self.precision = "bfloat16"
 
     def forward(
@@ -265,8 +270,9 @@ class Reconstructor(nn.Module):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
-        if self.config.surface and surface.lift is None:
-            raise ValueError("surface.lift is missing, which a model with config.surface needs")
+        for name in ("lift", "shape") if self.config.surface else ():
+            if getattr(surface, name) is None:
+                raise ValueError(f"surface.{name} is missing, which a model with config.surface needs")
         size = self.config.map_size
         if len(texel) and (int(texel.min()) < 0 or int(texel.max()) >= size * size):
             raise ValueError(f"texel must index an atlas of {size}x{size} texels (config.map_size)")

@@ -123,7 +123,7 @@ TRAINING: dict[str, TrainConfig] = {
         learning_rate=2e-3,
         warmup=50,
         precision="float32",
-        losses=LossWeights(alpha=0.3, atlas=1.0, relief=5.0),
+        losses=LossWeights(alpha=0.3, atlas=1.0, relief=15.0),
     ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
     # The paper's recipe: no running mean, losses as printed.

@@ -46,6 +46,7 @@ class Item:
     scales: Tensor  # [M,3]
     prior: Tensor  # [3,A,A] supposed colours of the atlas
     lift: Tensor  # [1,A,A] metres of hair over the bald head
+    shape: Tensor  # [3,A,A] metres off the mean head
     canonical: Tensor  # [N,3] vertices
     posed: Tensor  # [D,N,3] vertices
     viewmats: Tensor  # [D,4,4]
@@ -113,7 +114,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         keys = tuple(view.key for view in (*photos, *pictures))
         none = torch.zeros(0)
         if config.part == "estimator":
-            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 14)
+            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 15)
         fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
         uv, valid, weight = pixel_uv(fit, head, masks)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -138,6 +139,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             scales=surface.scales[0],
             prior=none if surface.prior is None else surface.prior,
             lift=none if surface.lift is None else surface.lift,
+            shape=none if surface.shape is None else surface.shape,
             canonical=shaped_vertices(head, HeadParameters.zeros(head).replace(identity=identity), fit.static_offset),
             posed=posed,
             viewmats=cameras.viewmat,

@@ -62,6 +62,7 @@ class GaussianNetwork(nn.Module):
             self._regions.to(device),
             item.prior if len(item.prior) else None,
             item.lift,
+            item.shape,
         )
         photos = (item.images[None], item.masks[None], item.uv[None], item.weights[None])
         views = self.model.encode(*photos)
