@@ -53,3 +53,33 @@ def test_scales_keep_to_their_least_ratio(least: float, small: ModelConfig, make
         model.gs_decoder.gs_net.out_layers["scaling"].bias.fill_(math.log(0.5))  # type: ignore[union-attr]
         ratio = model(**inputs).scales / inputs["surface"].scales
     torch.testing.assert_close(ratio, torch.full_like(ratio, max(least, 0.5)))
+
+
+def test_detail_adds_the_fine_relief_of_the_observation_where_colours_are_predicted(
+    small: ModelConfig, make_inputs: Make
+) -> None:
+    small = dataclasses.replace(small, map_size=112)
+    gaussians = dataclasses.replace(small.gaussians, fusion_bias=20.0)
+    inputs = make_inputs(side=96, map_size=112)
+    with torch.no_grad():
+        plain, detailed = (
+            build(dataclasses.replace(small, gaussians=gaussians, detail=share)).eval()(**inputs)
+            for share in (0.0, 0.5)
+        )
+    size, texel = small.map_size, inputs["texel"]
+    inside = torch.zeros(size * size, dtype=torch.bool)
+    inside[texel] = True
+    reach, expected = size // 52, plain.colors.double()
+    seen = plain.aggregate[0].double()
+    where = inside.view(size, size).double()[None]
+    rows = torch.arange(size)
+
+    def around(values: torch.Tensor) -> torch.Tensor:
+        # Twice the mean of a square; zeros count beyond the atlas's border, of colours and of places alike.
+        box = ((rows[:, None] - rows).abs() <= reach).double() / (2 * reach + 1)
+        return box @ box @ values @ box @ box
+
+    relief = seen - around(seen * where) / around(where)
+    expected = expected + 0.5 * relief.flatten(1)[:, texel].T
+    torch.testing.assert_close(detailed.colors.double(), expected.clamp(0, 1), rtol=0, atol=1e-5)
+    assert (detailed.colors - plain.colors).abs().max() > 0.05

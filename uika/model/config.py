@@ -105,6 +105,8 @@ class ModelConfig:
                       everybody
     palette           number of colours, each a weighted mean of what the photos show, that a predicted colour may be
                       mixed from; 0 for none; not in the paper
+    detail            share of the completed observation's fine relief of colours that predicted colours take over; a
+                      network that is trained on mean errors paints smooth; not in the paper
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
     """
 
@@ -126,6 +128,7 @@ class ModelConfig:
     aggregation: bool = True
     surface: bool = False
     palette: int = 0
+    detail: float = 0.0
     fusion: Literal["learned", "fixed"] = "learned"
 
     def __post_init__(self) -> None:
@@ -143,6 +146,7 @@ class ModelConfig:
             (self.token_grid % 2 == 0, "token_grid must be even"),
             (self.fusion in ("learned", "fixed"), 'fusion must be "learned" or "fixed"'),
             (0 <= self.palette <= 64, "palette must lie in 0..64"),
+            (0 <= self.detail <= 1, "detail must lie in [0,1]"),
             (0 <= self.gaussians.least_scale <= 1, "gaussians.least_scale must lie in [0,1]"),
             (self.uv.full_trust > 0, "uv.full_trust must be positive"),
             (0 < self.gaussians.init_opacity < 1, "gaussians.init_opacity must lie strictly between 0 and 1"),
@@ -200,6 +204,7 @@ PRESETS: dict[str, ModelConfig] = {
         gaussians=dataclasses.replace(_SURFACE, least_scale=0.75),
         surface=True,
         palette=8,
+        detail=0.7,
     ),
     "base": ModelConfig(
         name="base",

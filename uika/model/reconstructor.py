@@ -8,52 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from uika.model.config import ModelConfig
-from uika.model.dpt import UvDpt, resize
+from uika.model.decoder import GaussianDecoder
+from uika.model.dpt import resize
 from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
-from uika.model.heads import AttributeHeads, Attributes, Palette, TexelMlp
 from uika.model.observation import Observation, observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
-
-_LIFT_UNIT, _SHAPE_UNIT = 10.0, 30.0  # channel values of a metre of hair, of a metre off the mean head
-_TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
-
-
-class GaussianDecoder(nn.Module):
-    """Tokens and aggregate -> Gaussian attributes at the valid texels (paper eq. 8)."""
-
-    def __init__(self, config: ModelConfig) -> None:
-        """Sizes from `config`."""
-        super().__init__()
-        self.map_size = config.map_size
-        self.aggregation, self.surface = config.aggregation, config.surface
-        self.dpt_decoder = UvDpt(config)
-        self.mlp_net = TexelMlp(config.dpt_features, config.mlp_width)
-        self.gs_net = AttributeHeads(config)
-        if self.gs_net.palette:
-            self.palette = Palette(config.dpt_features, config.palette)
-
-    def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
-        """Tokens of four depths, observed [B,4,S,S], texel [M]."""
-        maps = [observed] if self.aggregation else []
-        if self.surface and surface.lift is not None and surface.shape is not None:
-            stand = torch.cat((_LIFT_UNIT * surface.lift, _SHAPE_UNIT * surface.shape))
-            maps.append(stand.to(observed.dtype).expand(len(observed), -1, -1, -1))
-        seen_maps = torch.cat(maps, dim=1) if maps else observed
-        features = resize(self.dpt_decoder(tokens, seen_maps), (self.map_size, self.map_size))
-        features, seen = _gather(features, texel), _gather(observed, texel)
-        # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
-        with torch.autocast(features.device.type, enabled=False):
-            parts = []
-            palette = self.palette(features.to(seen.dtype), seen) if self.gs_net.palette else None
-            for first in range(0, max(len(texel), 1), _TEXELS):
-                rows = slice(first, first + _TEXELS)
-                inner = self.mlp_net(features[:, rows].to(seen.dtype))
-                parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS), palette))
-        return Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
 
 
 class Reconstructor(nn.Module):
@@ -280,9 +243,3 @@ class Reconstructor(nn.Module):
             shape = getattr(surface, name).shape
             if len(shape) != 3 or shape[0] not in (1, len(images)) or tuple(shape[1:]) != (len(texel), channels):
                 raise ValueError(f"surface.{name} must be [B or 1,{len(texel)},{channels}], got {list(shape)}")
-
-
-def _gather(maps: Tensor, texel: Tensor) -> Tensor:
-    """[B,C,S,S] at row-major texels [M] -> [B,M,C]."""
-    # Whole rows of channels are picked, which lie together in maps that are channels last.
-    return maps.permute(0, 2, 3, 1).flatten(1, 2).index_select(1, texel)

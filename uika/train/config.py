@@ -91,8 +91,8 @@ class TrainConfig:
 
     @property
     def model(self) -> ModelConfig:
-        """Architecture of the reconstructor in training: the fusion weight's start, the side of the atlas."""
-        config = dataclasses.replace(self.finished, map_size=self.texels or self.finished.map_size)
+        """Architecture of the reconstructor in training: the fusion weight's start, the atlas's side, no detail."""
+        config = dataclasses.replace(self.finished, map_size=self.texels or self.finished.map_size, detail=0.0)
         start = config.gaussians
         if start.fusion_bias is None or start.fusion_bias >= self.fusion_bias:
             return config

@@ -42,7 +42,8 @@ def export(path: Path, task: Task, mean: RunningMean, config: TrainConfig, progr
         "step": str(progress.step),
     }
     if isinstance(task.model, Reconstructor):
-        copy = Reconstructor(dataclasses.replace(task.model.config, map_size=config.finished.map_size))
+        used = {name: getattr(config.finished, name) for name in ("map_size", "detail")}
+        copy = Reconstructor(dataclasses.replace(task.model.config, **used))
         copy.load_state_dict(state)
         save_checkpoint(path, copy, torch.bfloat16, provenance)
     elif isinstance(task.model, Estimator):

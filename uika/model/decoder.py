@@ -1,0 +1,78 @@
+"""From tokens and the observation to the attributes of every Gaussian (paper section 3.3)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from uika.model.config import ModelConfig
+from uika.model.dpt import UvDpt, resize
+from uika.model.gaussians import SurfaceTexels
+from uika.model.heads import AttributeHeads, Attributes, Palette, TexelMlp
+
+_LIFT_UNIT, _SHAPE_UNIT = 10.0, 30.0  # channel values of a metre of hair, of a metre off the mean head
+_COARSE = 52  # what is wider than this part of the atlas is no fine relief
+_TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
+
+
+class GaussianDecoder(nn.Module):
+    """Tokens and aggregate -> Gaussian attributes at the valid texels (paper eq. 8)."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        """Sizes from `config`."""
+        super().__init__()
+        self.map_size = config.map_size
+        self.aggregation, self.surface = config.aggregation, config.surface
+        self.detail = config.detail if config.aggregation else 0.0
+        self.dpt_decoder = UvDpt(config)
+        self.mlp_net = TexelMlp(config.dpt_features, config.mlp_width)
+        self.gs_net = AttributeHeads(config)
+        if self.gs_net.palette:
+            self.palette = Palette(config.dpt_features, config.palette)
+
+    def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
+        """Tokens of four depths, observed [B,4,S,S], texel [M]."""
+        maps = [observed] if self.aggregation else []
+        if self.surface and surface.lift is not None and surface.shape is not None:
+            stand = torch.cat((_LIFT_UNIT * surface.lift, _SHAPE_UNIT * surface.shape))
+            maps.append(stand.to(observed.dtype).expand(len(observed), -1, -1, -1))
+        seen_maps = torch.cat(maps, dim=1) if maps else observed
+        features = resize(self.dpt_decoder(tokens, seen_maps), (self.map_size, self.map_size))
+        features, seen = _gather(features, texel), _gather(observed, texel)
+        # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
+        with torch.autocast(features.device.type, enabled=False):
+            parts = []
+            palette = self.palette(features.to(seen.dtype), seen) if self.gs_net.palette else None
+            for first in range(0, max(len(texel), 1), _TEXELS):
+                rows = slice(first, first + _TEXELS)
+                inner = self.mlp_net(features[:, rows].to(seen.dtype))
+                parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS), palette))
+        result = Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
+        if not self.detail:
+            return result
+        relief = _gather(_fine(observed[:, :3], texel), texel)
+        colors = result.colors + self.detail * result.fusion_weight[..., None] * relief
+        return result._replace(colors=colors.clamp(0, 1))
+
+
+def _fine(color: Tensor, texel: Tensor) -> Tensor:
+    """What [B,3,S,S] sets colours apart from the mean around them, of valid texels alone."""
+    size = color.shape[-1]
+    reach = size // _COARSE
+    valid = color.new_zeros(size * size)
+    valid[texel] = 1
+    valid = valid.view(1, 1, size, size)
+
+    def around(values: Tensor) -> Tensor:
+        for _ in range(2):
+            values = functional.avg_pool2d(values, 2 * reach + 1, 1, reach)
+        return values
+
+    return color - around(color * valid) / around(valid).clamp_min(1e-6)
+
+
+def _gather(maps: Tensor, texel: Tensor) -> Tensor:
+    """[B,C,S,S] at row-major texels [M] -> [B,M,C]."""
+    # Whole rows of channels are picked, which lie together in maps that are channels last.
+    return maps.permute(0, 2, 3, 1).flatten(1, 2).index_select(1, texel)
