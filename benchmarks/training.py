@@ -41,7 +41,9 @@ def steps_done(log: Path) -> int:
 def start(words: Sequence[str]) -> subprocess.Popen[bytes]:
     """A training in a process group of its own."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([sys.executable, *words], start_new_session=True, **quiet)  # type: ignore[call-overload, no-any-return]
+    # With several threads torch adds gradients in no fixed order, and two runs drift apart that nobody killed.
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen([sys.executable, *words], start_new_session=True, env=environment, **quiet)  # type: ignore[call-overload, no-any-return]
 
 
 def watched(words: Sequence[str], log: Path) -> list[tuple[int, float]]:
@@ -50,8 +52,8 @@ def watched(words: Sequence[str], log: Path) -> list[tuple[int, float]]:
     while process.poll() is None:
         time.sleep(1)
         status = Path(f"/proc/{process.pid}/statm")
-        if status.exists():
-            pages = int(status.read_text().split()[1])
+        pages = int(status.read_text().split()[1]) if status.exists() else 0
+        if pages:  # an ending process has none
             seen.append((steps_done(log), pages * os.sysconf("SC_PAGESIZE") / 2**20))
     if process.returncode:
         raise SystemExit(f"training failed with {process.returncode}: {' '.join(words)}")
