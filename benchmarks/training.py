@@ -151,11 +151,14 @@ def main() -> None:
         equal = side_by_side(folder, options.data)
         logs = [read_log(each) for each in (whole, cut, long)]
     draw(logs[0], logs[1], kills, memory)
-    apart = max(abs(a["loss"] - b["loss"]) / a["loss"] for a, b in zip(logs[0], logs[1], strict=True))
+    differences = [abs(a["loss"] - b["loss"]) / a["loss"] for a, b in zip(logs[0], logs[1], strict=True)]
+    untouched = kills[0] // SAVE_EVERY * SAVE_EVERY  # steps that the first process took and nobody took again
     tenth = [size for step, size in memory if step >= options.long // 10]
     text = (
         f"Killed at steps {', '.join(map(str, kills))} and continued: the losses of all {options.steps} steps equal "
-        f"those of the run left alone to a relative {apart:.1e}.\n\n"
+        f"those of the run left alone to a relative {max(differences):.1e}. Sums in another order make two runs drift "
+        f"apart that nobody kills: over the {untouched} steps before the first kill {max(differences[:untouched]):.1e}"
+        ".\n\n"
         f"Memory of the trainer after a tenth of {options.long} steps {tenth[0]:.0f} MiB, at most {max(tenth):.0f} MiB"
         f", at the end {tenth[-1]:.0f} MiB.\n\n"
         f"Two gloo processes beside one with the same heads a step:\n\n{markdown(equal)}\n\n"

@@ -53,7 +53,7 @@ class GaussianConfig:
     fusion_bias    initial logit of the fusion weight where nothing was seen; predicted colours then start as the
                    completed observation. None leaves the colour layer at the default random initialisation
     fusion_trust   how much that logit falls, at the start, as confidence goes from 0 to 1
-    least_scale    smallest ratio of a scale to the texel size (relative only), lest coarse training atlases teach holes
+    least_scale    smallest ratio of a scale to the texel size (relative only): 1 keeps the surface closed
     """
 
     relative: bool
@@ -201,7 +201,7 @@ PRESETS: dict[str, ModelConfig] = {
         dpt_features=48,
         mlp_width=64,
         uv=UvConfig(),
-        gaussians=dataclasses.replace(_SURFACE, least_scale=0.75),
+        gaussians=dataclasses.replace(_SURFACE, least_scale=1.0),
         surface=True,
         palette=8,
         detail=0.7,

@@ -43,6 +43,7 @@ class TrainConfig:
     # weight so low that predicted colours would not learn.
     fusion_bias: float = 1.0
     fusion_trust: float = 12.0
+    least_scale: float | None = None  # in training, on an atlas coarser than in use; None for the preset's own
     steps: int = 20000
     seed: int = 0
     # Data
@@ -93,6 +94,9 @@ class TrainConfig:
     def model(self) -> ModelConfig:
         """Architecture of the reconstructor in training: the fusion weight's start, the atlas's side, no detail."""
         config = dataclasses.replace(self.finished, map_size=self.texels or self.finished.map_size, detail=0.0)
+        if self.least_scale is not None:
+            start = dataclasses.replace(config.gaussians, least_scale=self.least_scale)
+            config = dataclasses.replace(config, gaussians=start)
         start = config.gaussians
         if start.fusion_bias is None or start.fusion_bias >= self.fusion_bias:
             return config
@@ -119,6 +123,7 @@ TRAINING: dict[str, TrainConfig] = {
         items=3,
         fitted=0.5,
         texels=192,
+        least_scale=0.75,
         atlas_views=4,
         learning_rate=2e-3,
         warmup=50,

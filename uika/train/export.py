@@ -15,7 +15,7 @@ from uika._version import __version__
 from uika.files import write_tensors
 from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, load_checkpoint, save_checkpoint
 from uika.model.checkpoint import check_depth
-from uika.model.config import BackboneConfig
+from uika.model.config import BackboneConfig, ModelConfig
 from uika.train.checkpoint import Progress
 from uika.train.config import TrainConfig
 from uika.train.optimiser import RunningMean
@@ -42,8 +42,7 @@ def export(path: Path, task: Task, mean: RunningMean, config: TrainConfig, progr
         "step": str(progress.step),
     }
     if isinstance(task.model, Reconstructor):
-        used = {name: getattr(config.finished, name) for name in ("map_size", "detail")}
-        copy = Reconstructor(dataclasses.replace(task.model.config, **used))
+        copy = Reconstructor(_in_use(task.model.config, config.finished))
         copy.load_state_dict(state)
         save_checkpoint(path, copy, torch.bfloat16, provenance)
     elif isinstance(task.model, Estimator):
@@ -86,6 +85,12 @@ def load_estimator(path: str | Path) -> Estimator:
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: cannot be read as an estimator ({error})") from error
     return model.eval()
+
+
+def _in_use(trained: ModelConfig, finished: ModelConfig) -> ModelConfig:
+    """A trained architecture with the values that differ between training and use."""
+    gaussians = dataclasses.replace(trained.gaussians, least_scale=finished.gaussians.least_scale)
+    return dataclasses.replace(trained, map_size=finished.map_size, detail=finished.detail, gaussians=gaussians)
 
 
 def _save_estimator(path: Path, config: EstimatorConfig, state: dict[str, Tensor], provenance: dict[str, str]) -> None:
