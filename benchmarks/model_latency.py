@@ -94,7 +94,8 @@ class Kept:
         """The five tensors that results with `count` views are compared with: the first that was given."""
         path = None if self._folder is None else self._folder / f"{count}.safetensors"
         if count not in self._references and path is not None and path.exists():
-            self._references[count] = list(load_file(path).values())
+            tensors = load_file(path)
+            self._references[count] = [tensors[str(index)] for index in range(len(tensors))]
         if count not in self._references:
             self._references[count] = [part.float().contiguous() for part in result]
             if path is not None:
