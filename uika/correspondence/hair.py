@@ -34,6 +34,7 @@ class _Region:
     vertices: Tensor  # [R] vertex ids that may move
     smoothness: Any  # [R,R] sparse quadratic form of the membrane
     share: Tensor  # [R] in [0,1], how freely each may move
+    lowest: Tensor  # [R] metres, how far each may move inward
 
 
 def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor) -> Tensor:
@@ -128,7 +129,9 @@ def _region(head: HeadModel, edges: Tensor) -> _Region:
     adjacency = sparse.csr_matrix((weight[both], (start[both], end[both])), shape=(R, R))
     laplacian = sparse.identity(R) - sparse.diags(1.0 / degree) @ adjacency
     smoothness = BENDING * laplacian.T @ laplacian + 0.5 * TENSION * (laplacian + laplacian.T)
-    return _Region(vertices, smoothness, share[vertices])
+    # Mattes of heads end at the jaw: that they show no neck does not mean that there is none.
+    lowest = MIN_OFFSET * (1 - head.masks["neck"].clamp(0, 1))
+    return _Region(vertices, smoothness, share[vertices], lowest[vertices])
 
 
 def _centres(head: HeadModel, parameters: HeadParameters, cameras: Camera) -> Tensor:
@@ -189,9 +192,9 @@ def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor) -> 
     from scipy.sparse.linalg import spsolve
 
     weight = pull.double().numpy()
-    target = (height[region.vertices] + wanted).clamp(MIN_OFFSET, MAX_OFFSET).double().numpy()
+    target = (height[region.vertices] + wanted).clamp(max=MAX_OFFSET).maximum(region.lowest).double().numpy()
     stiff = FACE_PULL * (1.0 / region.share.double().clamp(min=0.02).numpy() - 1.0)
     solved = spsolve((region.smoothness + sparse.diags(weight + BACK_PULL + stiff)).tocsc(), weight * target)
     out = torch.zeros_like(height)
-    out[region.vertices] = torch.from_numpy(solved).float().clamp(MIN_OFFSET, MAX_OFFSET)
+    out[region.vertices] = torch.from_numpy(solved).float().clamp(max=MAX_OFFSET).maximum(region.lowest)
     return out
