@@ -59,6 +59,17 @@ def test_a_bald_matte_asks_for_no_hair(head: HeadModel) -> None:
     assert fit_hair(head, HeadParameters.zeros(head, 1), camera, matte).norm(dim=-1).max() < 0.006
 
 
+def test_a_matte_cut_at_the_jaw_leaves_the_neck(head: HeadModel) -> None:
+    camera = Camera.stack([look_at(20.0, 0.0, 1.0, fov_y=22.0, size=SIZE)])
+    neck = head.masks["neck"] > 0.99
+    above = head.faces[~neck[head.faces].any(-1)]
+    points, depth = project(head.template, camera[0])
+    matte = rasterize(points, above, SIZE, SIZE, depth=depth, cull="none")[0] >= 0
+    assert (covered(head, head.template, camera[0]) & ~matte).sum() > 500
+    offset = fit_hair(head, HeadParameters.zeros(head, 1), camera, matte[None].float())
+    assert offset[neck].norm(dim=-1).max() < 0.003
+
+
 def test_pixel_uv_is_the_uv_of_the_surface_point(head: HeadModel) -> None:
     camera = look_at(20.0, 5.0, 1.0, fov_y=22.0, size=SIZE)
     uv, valid, weight = pixel_uv(fitted(head, camera), head, torch.ones(1, SIZE, SIZE))
