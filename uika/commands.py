@@ -42,7 +42,7 @@ class Reconstruct:
     """The avatar file to write."""
     model: str = "tiny"
     """tiny, none, or a trained model file."""
-    refine: bool = False
+    refine: bool = True
     """Refine face shape and poses with the colours that two or more photos share."""
     keep: Literal["all", "foreground"] = "all"
     """foreground leaves out patches without head: quicker from several photos, nearly the same."""
@@ -59,8 +59,8 @@ class Reconstruct:
         result = reconstruct(self.photos, model=self.model, refine=self.refine, keep=self.keep)
         stamped(result.avatar, consent=self.consent).save(target)
         _print_seconds(result.report)
-        if self.refine:
-            print(f"refined: {result.fit.gain or 'needs two or more photos'}")
+        if result.fit.gain:
+            print(f"refined: {result.fit.gain}")
         print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
         return 0
 

@@ -83,7 +83,7 @@ def reconstruct(
     head: HeadModel | None = None,
     model: str | Path = "tiny",
     *,
-    refine: bool = False,
+    refine: bool = True,
     keep: Keep = "all",
     report: Report | None = None,
 ) -> Reconstruction:
@@ -119,7 +119,7 @@ def reconstruct(
 
 
 def fit_files(
-    photos: Sequence[str | Path], head: HeadModel, *, refine: bool = False, report: Report | None = None
+    photos: Sequence[str | Path], head: HeadModel, *, refine: bool = True, report: Report | None = None
 ) -> FittedPhotos:
     """Read photos of one person and fit the head to them; they come out in the order of their content hashes.
 
@@ -145,7 +145,7 @@ def prepare_file(path: str | Path) -> PreparedPhoto:
 
 
 def fit_prepared(
-    prepared: Sequence[PreparedPhoto], head: HeadModel, *, refine: bool = False, report: Report | None = None
+    prepared: Sequence[PreparedPhoto], head: HeadModel, *, refine: bool = True, report: Report | None = None
 ) -> FittedPhotos:
     """Fit the head to prepared photos of one person; they come out in the order of their content hashes."""
     from uika.correspondence import fit_photos

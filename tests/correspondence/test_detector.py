@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from uika.correspondence import fit_landmarks
+from uika.correspondence import fit_landmarks, fit_photos
 from uika.correspondence.detector import detector_bias, unbiased, upright, view_polynomials
 from uika.correspondence.landmarks import LandmarkFit, eye_distance
-from uika.head import HeadModel, load_head, look_at, project
+from uika.head import Camera, HeadModel, load_head, look_at, project
 
 SIZE = 512
 
@@ -43,6 +43,30 @@ def test_a_biased_detection_is_set_right(head: HeadModel, yaw: float) -> None:
     before, after = ((m - marks)[at].norm(dim=-1).mean() for m in (wrong, corrected))
     assert before > 0.01 * unit
     assert after < 0.3 * before
+
+
+class Marks:
+    """A photo of which nothing but landmarks is known."""
+
+    def __init__(self, landmarks: Tensor) -> None:
+        self.landmarks, self.matte = landmarks, torch.ones(SIZE, SIZE)
+
+
+def test_several_photos_are_freed_from_it_and_then_agree(head: HeadModel) -> None:
+    photos = []
+    for yaw in (0.0, 40.0, -40.0):
+        marks, rotation, unit = seen(head, yaw)
+        error = torch.einsum("nf,flc->nlc", view_polynomials(-rotation[None, 2]), detector_bias())[0]
+        photos.append(Marks(marks + (unit * error @ upright(rotation[None])[0]).float()))
+    chosen, biased = fit_photos(photos, head), fit_photos(photos, head, correct_detector=False)
+
+    def wrong_distance(cameras: Camera) -> float:
+        return float((cameras.viewmat[:, 2, 3] / 1.1).log().abs().max())
+
+    assert chosen.parameters.identity[0].norm() < 0.5 * biased.parameters.identity[0].norm()
+    assert wrong_distance(chosen.cameras) < 0.5 * wrong_distance(biased.cameras)
+    alone, as_found = (fit_photos(photos[1:2], head, correct_detector=way) for way in (None, False))
+    assert torch.equal(alone.parameters.identity, as_found.parameters.identity)
 
 
 def test_the_correction_turns_with_the_picture(head: HeadModel) -> None:

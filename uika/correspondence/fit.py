@@ -50,7 +50,7 @@ def fit_photos(
     head_mattes: Sequence[Tensor] | None = None,
     *,
     images: Sequence[Tensor] | None = None,
-    correct_detector: bool = False,
+    correct_detector: bool | None = None,
     known: Fit | None = None,
 ) -> Fit:
     """Fit one identity to all photos and expression, camera and hair to each (float32).
@@ -60,8 +60,9 @@ def fit_photos(
         head: the head model.
         head_mattes: [S,S] per photo, head and hair without shoulders; None fits no hair.
         images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours they share; None does not.
-        correct_detector: take the face mesh's mean error on turned faces out of the landmarks first. It brings the
-            shape nearer to the truth, but two views of one head then agree less in colour.
+        correct_detector: take the face mesh's mean error on turned faces out of the landmarks first. It moves marks off
+            the contours that they were found at, but several views then agree on shape and distance. None does so
+            where views have to agree: with two or more photos, or a known person.
         known: an earlier fit of the person, whose identity and hair are kept as they are.
 
     Raises:
@@ -74,6 +75,8 @@ def fit_photos(
         raise ValueError(f"photos: all crops must have one size, got {sorted(sizes)}")
     height, width = sizes.pop()
     landmarks = torch.stack([photo.landmarks for photo in photos])
+    if correct_detector is None:
+        correct_detector = len(photos) > 1 or known is not None
     if correct_detector:
         landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width), head)
     identity = None if known is None else known.parameters.identity[0]

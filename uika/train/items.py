@@ -215,7 +215,7 @@ def _fit(photos: list[View], masks: Tensor, head: HeadModel, random: np.random.G
         landmarks = torch.zeros(_FACE_MESH_POINTS, 2)
         landmarks[head.landmark_ids] = pixels + width * (bias + noise)
         found.append(_Photo(landmarks, mask))
-    return fit_photos(found, head, [photo.matte for photo in found])
+    return fit_photos(found, head, [photo.matte for photo in found], correct_detector=False)
 
 
 @dataclass(frozen=True, eq=False)
