@@ -38,7 +38,8 @@ class GaussianDecoder(nn.Module):
             stand = torch.cat((_LIFT_UNIT * surface.lift, _SHAPE_UNIT * surface.shape))
             maps.append(stand.to(observed.dtype).expand(len(observed), -1, -1, -1))
         seen_maps = torch.cat(maps, dim=1) if maps else observed
-        features = resize(self.dpt_decoder(tokens, seen_maps), (self.map_size, self.map_size))
+        coarse = self.dpt_decoder(tokens, seen_maps).contiguous(memory_format=torch.channels_last)
+        features = resize(coarse, (self.map_size, self.map_size))
         features, seen = _gather(features, texel), _gather(observed, texel)
         # Attributes are read to a fraction of a millimetre, finer than bfloat16 tells numbers apart.
         with torch.autocast(features.device.type, enabled=False):
@@ -64,12 +65,17 @@ def _fine(color: Tensor, texel: Tensor) -> Tensor:
     valid[texel] = 1
     valid = valid.view(1, 1, size, size)
 
-    def around(values: Tensor) -> Tensor:
-        for _ in range(2):
-            values = functional.avg_pool2d(values, 2 * reach + 1, 1, reach)
-        return values
+    around = torch.cat((color * valid, valid.expand(len(color), -1, -1, -1)), dim=1)
+    for _ in range(2):
+        around = _box_sums(_box_sums(around, reach, -1), reach, -2) / (2 * reach + 1) ** 2
+    return color - around[:, :3] / around[:, 3:].clamp_min(1e-6)
 
-    return color - around(color * valid) / around(valid).clamp_min(1e-6)
+
+def _box_sums(maps: Tensor, reach: int, axis: int) -> Tensor:
+    """Sums along an axis of all that is at most `reach` away: differences of one running sum."""
+    running = functional.pad(maps, (0, 0) * (-1 - axis) + (reach + 1, reach)).cumsum(axis)
+    size = maps.shape[axis]
+    return running.narrow(axis, 2 * reach + 1, size) - running.narrow(axis, 0, size)
 
 
 def _gather(maps: Tensor, texel: Tensor) -> Tensor:

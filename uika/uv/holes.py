@@ -23,9 +23,7 @@ def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, rad
     seen = weight > 0
     sums = _blur(torch.cat([values * weight, weight, seen.to(values.dtype)], dim=1), radius)
     total, neighbours = sums[:, channels : channels + 1], sums[:, channels + 1 :]
-    # Not `total > 0`: some convolution algorithms leave rounding errors where every term is 0.
-    near = functional.max_pool2d(seen.to(values.dtype), 2 * radius + 1, stride=1, padding=radius) > 0
-    hole = ~seen & near
+    hole = ~seen & (neighbours > 0)
     if valid is not None:
         hole &= valid
     tiny = torch.finfo(values.dtype).tiny
