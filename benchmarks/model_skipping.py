@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,13 +30,15 @@ from uika.avatar import Avatar
 from uika.correspondence import Fit, pixel_uv
 from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
+from uika.growing import GrowingAvatar
 from uika.head import HeadModel, HeadParameters, load_head
 from uika.metrics import psnr
 from uika.model import CanonicalGaussians, Keep, Reconstructor, Session
-from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model
+from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
 from uika.rendering import render
 from uika.train.crops import View
 from uika.train.people import find_people
+from uika.video import write_png
 
 SIZE = 256  # pixels of people's photos and of the pictures that are compared
 TARGETS = 8
@@ -148,6 +152,22 @@ def _increment(case: Case, model: Reconstructor, views: int, repeats: int, way: 
     }
 
 
+def from_files(case: Case, head: HeadModel, count: int) -> dict[str, Any]:
+    """Seconds for the last of `count` photo files and for all of them, preparation and fit included."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{index}.png" for index in range(count)]
+        for path, image in zip(paths, case.inputs.images[0], strict=False):
+            write_png(path, image.permute(1, 2, 0))
+        growing = GrowingAvatar(head=head)
+        growing.add(paths[:-1])
+        clock = [time.perf_counter()]
+        for task in (partial(growing.add, paths[-1:]), partial(reconstruct, paths, head)):
+            task()
+            clock.append(time.perf_counter())
+    new, whole = clock[1] - clock[0], clock[2] - clock[1]
+    return {"photos": count, "new s": round(new, 2), "whole s": round(whole, 2), "share": round(new / whole, 3)}
+
+
 def _inputs(loaded: LoadedModel, head: HeadModel, fit: Fit, images: Tensor, mattes: Tensor) -> ModelInputs:
     uv, valid, weight = pixel_uv(fit, head, mattes)
     uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -207,7 +227,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     text += markdown(summary(rows, "views"))
     if grown:
         text += f"\n\nThe last of {options.photos} photos, added to a session:\n\n{markdown(summary(grown, 'photos'))}"
-    save(options.name, "Network: skipping what shows nothing", text, {"rows": rows, "increments": grown})
+    files = from_files(cases[0], head, options.photos)
+    text += f"\n\nThe same from the portrait's files, preparation and fit included:\n\n{markdown([files])}"
+    save(
+        options.name, "Network: skipping what shows nothing", text, {"rows": rows, "increments": grown, "files": files}
+    )
     shown = {f"{row['set']}, {row['views']}": row for row in summary(rows, "views")}
     panels = {"time": {way: {label: row[f"{way} ms"] for label, row in shown.items()} for way in WAYS}}
     bars(options.name, panels, "milliseconds")
