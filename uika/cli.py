@@ -22,6 +22,7 @@ from uika.errors import UikaError, install_command
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
 _PATIENCE = 1.5  # seconds from an interrupt to the end
 _said = threading.Event()
+_is_process = threading.Event()  # whether this process runs one command and nothing else
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
         _say_interrupted()
+        if _is_process.is_set():
+            _end()
         return _INTERRUPTED
     except Exception as error:
         if debug:
@@ -59,12 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run() -> NoReturn:
     """Run one command as the process, and end the process with its exit code; an interrupt ends it within seconds."""
     _watch_for_interrupts()
-    code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if code == _INTERRUPTED:
-        _end()
-    sys.exit(code)
+    _is_process.set()
+    sys.exit(main())
 
 
 def _say_interrupted() -> None:
@@ -74,7 +73,11 @@ def _say_interrupted() -> None:
 
 
 def _end() -> NoReturn:
-    """Leave at once: threads and processes of loaders would be waited for, or abort this one."""
+    """Leave at once: threads and processes of loaders would be waited for, or abort and be complained of."""
+    if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGCHLD"):
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
     for child in multiprocessing.active_children():
         child.kill()
     os._exit(_INTERRUPTED)
