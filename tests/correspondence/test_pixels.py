@@ -6,6 +6,7 @@ from torch import Tensor
 
 from uika.correspondence import Fit, pixel_uv
 from uika.correspondence.hair import MAX_OFFSET, fit_hair
+from uika.correspondence.hanging import curtain
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, project, rasterize
 from uika.head import vertex_normals as normals_of
 
@@ -68,6 +69,29 @@ def test_a_matte_cut_at_the_jaw_leaves_the_neck(head: HeadModel) -> None:
     assert (covered(head, head.template, camera[0]) & ~matte).sum() > 500
     offset = fit_hair(head, HeadParameters.zeros(head, 1), camera, matte[None].float())
     assert offset[neck].norm(dim=-1).max() < 0.003
+
+
+@pytest.mark.parametrize("yaw", [0.0, 35.0])
+def test_hair_that_hangs_is_let_down(head: HeadModel, yaw: float) -> None:
+    camera = look_at(yaw, 0.0, 1.0, fov_y=26.0, size=SIZE)
+    lift = 0.01 * head.masks["scalp"][:, None] * torch.nn.functional.normalize(head.template, dim=-1)
+    truth = head.template + curtain(head, head.template, -0.15) + lift
+    offset = fit_hair(
+        head, HeadParameters.zeros(head, 1), Camera.stack([camera]), covered(head, truth, camera)[None].float()
+    )
+    assert -0.18 < float(offset[:, 1].min()) < -0.12
+    unseen = look_at(100.0, 0.0, 1.0, fov_y=26.0, size=SIZE)
+    got, wanted = (covered(head, vertices, unseen) for vertices in (head.template + offset, truth))
+    assert (got & wanted).sum() / (got | wanted).sum() > 0.9
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.02, 0.045])
+def test_short_and_curly_hair_does_not_hang(head: HeadModel, lift: float) -> None:
+    grown = head.template + lift * head.masks["scalp"][:, None] * normals_of(head.template, head.faces)
+    cameras = Camera.stack([look_at(yaw, 0.0, 1.0, fov_y=26.0, size=SIZE) for yaw in (0.0, 40.0)])
+    mattes = torch.stack([covered(head, grown, cameras[n]) for n in range(2)])
+    offset = fit_hair(head, HeadParameters.zeros(head, 2), cameras, mattes.float())
+    assert float(offset[:, 1].min()) > -0.06
 
 
 def test_pixel_uv_is_the_uv_of_the_surface_point(head: HeadModel) -> None:

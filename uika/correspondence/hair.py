@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.correspondence.hanging import hanging_hair, overlap
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project, vertex_normals
 
 MAX_OFFSET, MIN_OFFSET = 0.1, -0.02  # metres; hair pressed flat may lie inside the average skull
@@ -26,6 +27,10 @@ BACK_PULL = 1e-3
 FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
 EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows as it is, above which not at all
 EAR_RINGS, EAR_ROUNDS = 3, 80
+FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
+HANGING_LOSS = (
+    0.02  # of the overlap of mattes and silhouettes, below which what looks like hanging hair is hanging hair
+)
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
 
@@ -38,7 +43,9 @@ class _Region:
 
 
 def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor) -> Tensor:
-    """Offset [V,3] in metres that makes the silhouette meet the matte in every photo.
+    """Offset [V,3] in metres that makes the silhouette meet the matte in every photo: at most 0.1 m along the normals.
+
+    Hair that hangs beside the neck is let down first (`uika.correspondence.hanging`).
 
     Args:
         head: the head model.
@@ -48,32 +55,42 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
     """
     edges = _edges(head)
     region = _region(head, edges)
-    reach = torch.stack(
-        [_reach(matte, at[0]) for matte, at in zip(mattes, _centres(head, parameters, cameras), strict=True)]
-    )
+    centres = _centres(head, parameters, cameras)
+    reach = torch.stack([_reach(matte, at[0]) for matte, at in zip(mattes, centres, strict=True)])
     canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
     normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
     bald = pose_vertices(head, parameters)
 
     def lift(flat: Tensor) -> Tensor:
+        still = flat[:, 1] < -FALLEN
         height = torch.zeros(len(head.template))
         for _ in range(ROUNDS):
             # The cameras carry the pose, so the offset simply adds to the posed head.
             vertices = bald + flat + height[:, None] * normals
-            wanted, pull = _outline_demand(head, vertices, cameras, reach, region)
+            wanted, pull = _outline_demand(head, vertices, cameras, centres, reach, region)
+            pull = pull * ~still[region.vertices]
             height = _membrane(region, height, wanted, pull)
         return height
 
-    flat = torch.zeros_like(canonical)
-    height = lift(flat)
-    flat = _covered_ears(head, canonical, height, edges)
-    if bool((flat != 0).any()):
-        height = lift(flat)
-    offset = flat + height[:, None] * normals
-    return offset * (MAX_OFFSET / offset.norm(dim=-1, keepdim=True).clamp(min=MAX_OFFSET))
+    def whole(hanging: Tensor, hangs: bool) -> Tensor:
+        height = lift(hanging)
+        flat = _covered_ears(head, canonical, height, edges, hangs)
+        if bool((flat != 0).any()):
+            height = lift(hanging + flat)
+        offset = flat + height[:, None] * normals
+        return hanging + offset * (MAX_OFFSET / offset.norm(dim=-1, keepdim=True).clamp(min=MAX_OFFSET))
+
+    offset = whole(torch.zeros_like(canonical), False)
+    hanging = hanging_hair(head, bald, cameras, mattes)
+    if not bool((hanging != 0).any()):
+        return offset
+    # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any outline.
+    down = whole(hanging, True)
+    standing, fallen = (overlap(head, bald + each, cameras, mattes) for each in (offset, down))
+    return down if fallen > standing - HANGING_LOSS else offset
 
 
-def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Tensor) -> Tensor:
+def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Tensor, hanging: bool) -> Tensor:
     """Offset [V,3] that flattens an ear over which hair lies: its relief must not show through."""
     ears = head.masks["ears"]
     start, end = edges.T
@@ -90,7 +107,8 @@ def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Ten
     for side in (head.template[:, 0] > 0, head.template[:, 0] <= 0):
         weight = head.masks["ears"] * side
         lifted = (weight * height).sum() / weight.sum().clamp(min=1e-6)
-        share = torch.where(side, ((lifted - EAR_BARE) / (EAR_COVERED - EAR_BARE)).clamp(0, 1), share)
+        covered = torch.ones(()) if hanging else ((lifted - EAR_BARE) / (EAR_COVERED - EAR_BARE)).clamp(0, 1)
+        share = torch.where(side, covered, share)
     return share[:, None] * (smooth - canonical)
 
 
@@ -136,11 +154,9 @@ def _region(head: HeadModel, edges: Tensor) -> _Region:
 
 def _centres(head: HeadModel, parameters: HeadParameters, cameras: Camera) -> Tensor:
     """Pixels [N,1,2] of a point inside each posed skull from which the hair's outline is seen in every direction."""
-    return project(_scalp_mean(head, pose_vertices(head, parameters)), cameras)[0]
-
-
-def _scalp_mean(head: HeadModel, vertices: Tensor) -> Tensor:
-    return (vertices * head.masks["scalp"][:, None]).sum(-2, keepdim=True) / head.masks["scalp"].sum()
+    scalp = head.masks["scalp"]
+    middle = (pose_vertices(head, parameters) * scalp[:, None]).sum(-2, keepdim=True) / scalp.sum()
+    return project(middle, cameras)[0]
 
 
 def _reach(matte: Tensor, centre: Tensor) -> Tensor:
@@ -160,15 +176,14 @@ def _reach(matte: Tensor, centre: Tensor) -> Tensor:
 
 
 def _outline_demand(
-    head: HeadModel, vertices: Tensor, cameras: Camera, reach: Tensor, region: _Region
+    head: HeadModel, vertices: Tensor, cameras: Camera, centres: Tensor, reach: Tensor, region: _Region
 ) -> tuple[Tensor, Tensor]:
     """How far each region vertex should move along its normal [R] in metres, and how strongly [R], over all photos."""
     pixels, depth = project(vertices, cameras)
     normals = torch.nn.functional.normalize(vertex_normals(vertices, head.faces), dim=-1)
     turn = cameras.viewmat[..., :3, :3]
     normals = normals @ turn.mT
-    middle, _ = project(_scalp_mean(head, vertices), cameras)
-    ray = pixels - middle
+    ray = pixels - centres
     radius = ray.norm(dim=-1).clamp(min=1e-6)
     sector = (torch.atan2(ray[..., 1], ray[..., 0]) % (2 * torch.pi) / (2 * torch.pi) * ANGLES).long() % ANGLES
     skin = head.masks["mouth_inner"] + head.masks["eyeballs"] < 0.5
