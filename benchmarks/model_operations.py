@@ -82,7 +82,7 @@ class Counted:
             transformer.uv_token, transformer.uv_pos_embed = whole
             encoders = _count(lambda: (model.encoder.screen(photo), model.encoder.uv(map_)))
             tokens = [_meta(1, grid * grid, width) for _ in range(4)]
-            observed = _meta(1, 4 + self.config.surface, self.config.map_size, self.config.map_size)
+            observed = _meta(1, 4 + 4 * self.config.surface, self.config.map_size, self.config.map_size)
             decoder = _count(lambda: self._decode(tokens, observed))
         return {"encoders": encoders, "transformer": attention, "decoder": decoder}
 
@@ -95,8 +95,9 @@ class Counted:
     def _decode(self, tokens: list[Tensor], observed: Tensor) -> object:
         decoder, texels = self.model.gs_decoder, self.surface.points.shape[1]
         decoder.dpt_decoder(tokens, observed)
-        inner = decoder.mlp_net(_meta(1, texels, self.config.dpt_features))
-        return decoder.gs_net(inner, _meta(1, texels, 4), self.surface)
+        features, seen = _meta(1, texels, self.config.dpt_features), _meta(1, texels, 4)
+        palette = decoder.palette(features, seen) if decoder.gs_net.palette else None
+        return decoder.gs_net(decoder.mlp_net(features), seen, self.surface, palette)
 
     def _strip(self, photos: int, patches: int) -> Tensor:
         patch = self.config.backbone.patch_size
