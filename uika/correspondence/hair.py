@@ -28,9 +28,7 @@ FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
 EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows as it is, above which not at all
 EAR_RINGS, EAR_ROUNDS = 3, 80
 FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
-HANGING_LOSS = (
-    0.02  # of the overlap of mattes and silhouettes, below which what looks like hanging hair is hanging hair
-)
+HANGING_LOSS = 0.02  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
 
