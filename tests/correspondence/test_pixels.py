@@ -94,6 +94,31 @@ def test_short_and_curly_hair_does_not_hang(head: HeadModel, lift: float) -> Non
     assert float(offset[:, 1].min()) > -0.06
 
 
+def test_covered_ears_do_not_crumple(head: HeadModel) -> None:
+    camera = Camera.stack([look_at(0.0, 0.0, 1.0, fov_y=26.0, size=SIZE)])
+    grown = head.template + 0.04 * head.masks["scalp"][:, None] * normals_of(head.template, head.faces)
+    matte = covered(head, grown, camera[0])[None].float()
+    offset = fit_hair(head, HeadParameters.zeros(head, 1), camera, matte)
+    eyes = head.joints[3:5].mean(0)
+    x, y, z = (head.template - eyes).unbind(-1)
+    # The bowls of the ears fold most.
+    bowl = (x.abs() > 0.06) & ((y + 0.022).abs() < 0.016) & ((z + 0.077).abs() < 0.016)
+    assert bowl.sum() > 100
+    corners = head.faces[bowl[head.faces].all(-1)]
+    bent, flat = (_bending(vertices, corners) for vertices in (head.template, head.template + offset))
+    assert flat < 1.2 * bent
+    assert offset[head.masks["eyeballs"] > 0.5].abs().max() == 0.0
+
+
+def _bending(vertices: Tensor, corners: Tensor) -> float:
+    """Mean angle in radians between neighbouring triangles' vertex normals and their faces' normals."""
+    a, b, c = vertices[corners].unbind(1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    smooth = torch.zeros_like(vertices).index_add(0, corners.flatten(), normal.repeat_interleave(3, 0))
+    smooth = torch.nn.functional.normalize(smooth, dim=-1)
+    return float((smooth[corners] * normal[:, None]).sum(-1).clamp(-1, 1).acos().mean())
+
+
 def test_pixel_uv_is_the_uv_of_the_surface_point(head: HeadModel) -> None:
     camera = look_at(20.0, 5.0, 1.0, fov_y=22.0, size=SIZE)
     uv, valid, weight = pixel_uv(fitted(head, camera), head, torch.ones(1, SIZE, SIZE))

@@ -90,9 +90,9 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
 
 def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Tensor, hanging: bool) -> Tensor:
     """Offset [V,3] that flattens an ear over which hair lies: its relief must not show through."""
-    ears = head.masks["ears"]
+    ears = _filled(head.masks["ears"], edges)
     start, end = edges.T
-    # The mask is hollow where the ear is: close it, then leave out what belongs to the face and the neck.
+    # The mask is hollow in the folds too: close it, then leave out what belongs to the face and the neck.
     for reduction in ("amax",) * EAR_RINGS + ("amin",) * (EAR_RINGS - 1):
         ears = ears.scatter_reduce(0, start, ears[end], reduction)
     ears = ears * (1 - head.masks["face"]) * (1 - head.masks["neck"])
@@ -108,6 +108,20 @@ def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Ten
         covered = torch.ones(()) if hanging else ((lifted - EAR_BARE) / (EAR_COVERED - EAR_BARE)).clamp(0, 1)
         share = torch.where(side, covered, share)
     return share[:, None] * (smooth - canonical)
+
+
+def _filled(mask: Tensor, edges: Tensor) -> Tensor:
+    """The mask [V] with the hollows that it encloses, such as the ears' bowls."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    outside = mask < 0.5
+    free = edges[outside[edges].all(-1)].numpy()
+    graph = coo_matrix((np.ones(len(free)), free.T), shape=(len(mask),) * 2)
+    label = torch.from_numpy(connected_components(graph)[1])
+    start, end = edges.T
+    bordering = torch.isin(label, label[start[outside[start] & ~outside[end]]])
+    return torch.where(outside & bordering & (label != label[outside].mode().values), 1.0, mask)
 
 
 def _edges(head: HeadModel) -> Tensor:
