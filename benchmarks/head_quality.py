@@ -199,8 +199,10 @@ def _alignment(avatar: Avatar, truth: Avatar, head: HeadModel) -> tuple[float, T
 
 
 def _largest_change(first: Avatar, second: Avatar) -> float:
-    fields = ("means", "quats", "scales", "opacities", "colors")
-    return max(float((getattr(first, name) - getattr(second, name)).abs().max()) for name in fields)
+    turned = torch.where((first.quats * second.quats).sum(-1, keepdim=True) < 0, -second.quats, second.quats)
+    fields = ("means", "scales", "opacities", "colors")
+    changes = [getattr(first, name) - getattr(second, name) for name in fields]
+    return max(float(change.abs().max()) for change in (first.quats - turned, *changes))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
