@@ -89,7 +89,8 @@ class GrowingAvatar:
         with report.stage("fit"):
             known = None if self._growth is None else self._growth.fit
             photos, mattes = [photo for photo, _ in new], [hair for _, hair in new]
-            fit = fit_photos(photos, self._head, mattes, images=[photo.image for photo in photos], known=known)
+            pictures, focals = [photo.image for photo in photos], [photo.focal for photo in photos]
+            fit = fit_photos(photos, self._head, mattes, images=pictures, focals=focals, known=known)
         growth = self._growth or _Growth(self._loaded.network, self._head, fit, self._keep)
         growth.add([photo for photo, _ in new], fit, report)
         self._growth = growth

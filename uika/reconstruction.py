@@ -155,7 +155,8 @@ def fit_prepared(
     photos = [each.photo for each in ordered]
     with report.stage("fit"):
         pictures = [photo.image for photo in photos] if refine else None
-        fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures)
+        focals = [photo.focal for photo in photos]
+        fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures, focals=focals)
     images = torch.stack([photo.image for photo in photos])
     mattes = torch.stack([photo.matte for photo in photos])
     return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos])

@@ -66,6 +66,19 @@ def test_identity_is_recovered_and_more_views_help(head: HeadModel) -> None:
     assert errors[3] < 1.6
 
 
+def test_a_noted_focal_length_tells_the_distance(head: HeadModel) -> None:
+    marks, _ = observe(head, [35.0, -20.0], seed=4, noise=1.5)
+    true = SIZE / 2 / torch.tensor(20.0).deg2rad().div(2).tan()
+    focal = torch.stack((true, torch.tensor(torch.nan)))
+    noted, alone = fit_landmarks(marks, head, SIZE, focal=focal), fit_landmarks(marks, head, SIZE)
+    assert (noted.focal[0] / true).log().abs() < 0.03
+    assert (noted.focal[0] / true).log().abs() < (alone.focal[0] / true).log().abs()
+    with pytest.raises(ValueError, match="focal"):
+        fit_landmarks(marks, head, SIZE, focal=torch.tensor([-1.0, 2.0]))
+    with pytest.raises(ValueError, match="focal"):
+        fit_landmarks(marks, head, SIZE, focal=torch.tensor([900.0]))
+
+
 def test_outliers_do_not_pull_the_fit(head: HeadModel) -> None:
     marks, _ = observe(head, [10.0], seed=3)
     clean = fit_landmarks(marks, head, SIZE)

@@ -50,6 +50,7 @@ def fit_photos(
     head_mattes: Sequence[Tensor] | None = None,
     *,
     images: Sequence[Tensor] | None = None,
+    focals: Sequence[float | None] | None = None,
     correct_detector: bool | None = None,
     known: Fit | None = None,
 ) -> Fit:
@@ -60,6 +61,7 @@ def fit_photos(
         head: the head model.
         head_mattes: [S,S] per photo, head and hair without shoulders; None fits no hair.
         images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours they share; None does not.
+        focals: per photo, the focal length in crop pixels that its camera noted, None where it did not.
         correct_detector: take the face mesh's mean error on turned faces out of the landmarks first. It moves marks off
             the contours that they were found at, but several views then agree on shape and distance. None does so
             where views have to agree: with two or more photos, or a known person.
@@ -77,10 +79,11 @@ def fit_photos(
     landmarks = torch.stack([photo.landmarks for photo in photos])
     if correct_detector is None:
         correct_detector = len(photos) > 1 or known is not None
+    focal = torch.tensor([torch.nan if each is None else each for each in focals]) if focals is not None else None
     if correct_detector:
-        landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width), head)
+        landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width, focal=focal), head)
     identity = None if known is None else known.parameters.identity[0]
-    found, gain = fit_landmarks(landmarks, head, width, identity), None
+    found, gain = fit_landmarks(landmarks, head, width, identity, focal), None
     if images is not None and known is None:
         found, gain = refine_landmark_fit(found, images, landmarks, head)
     N = len(photos)

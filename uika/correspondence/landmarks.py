@@ -35,6 +35,7 @@ IDENTITY_PRIOR = (3.0, 1.2)  # weights of |identity|^2 in the two rounds
 EXPRESSION_PRIOR = 2.0
 BOUND_WEIGHT = 60.0  # soft walls at activations 0 and 1
 DISTANCE, DISTANCE_SPREAD = 1.1, 0.35  # metres and log-spread: focal length and distance trade off on one photo
+LENS_SPREAD = 0.05  # log-spread of focal lengths that cameras note
 STEPS = (12, 18)
 MAX_DAMPING = 1e9
 HIDDEN, FACING, HIDDEN_TRUST = 0.0, 0.6, 0.1  # cosines of the viewing angle between which a landmark gains trust
@@ -67,11 +68,14 @@ class _Problem:
     shape_rows: Tensor  # [L] 1 where the landmark tells about identity
     free: Tensor  # [E] 1 where the expression is fitted
     pixel_unit: Tensor  # [N] pixels of one outer eye-corner distance
+    lens: Tensor  # [N] pixels, the noted focal length; NaN where there is none
     identity_prior: float
     known: bool  # whether the identity stays as it is
 
 
-def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int, identity: Tensor | None = None) -> LandmarkFit:
+def fit_landmarks(
+    landmarks: Tensor, head: HeadModel, size: int, identity: Tensor | None = None, focal: Tensor | None = None
+) -> LandmarkFit:
     """Fit the head to N photos.
 
     Args:
@@ -79,14 +83,17 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int, identity: Tenso
         head: the head model (with its landmark embedding).
         size: side of the crops; the principal point is taken at the centre.
         identity: [K] of a person known from before; None fits it too.
+        focal: [N] pixels that the cameras noted, NaN where one did not; None if none did.
 
     Raises:
-        ValueError: the landmarks have another shape or are not finite.
+        ValueError: the landmarks have another shape or are not finite, or a focal length is not positive.
     """
     if landmarks.ndim != 3 or landmarks.shape[1:] != (MESH_POINTS, 2) or len(landmarks) == 0:
         raise ValueError(f"landmarks: need [N,{MESH_POINTS},2] with N >= 1, got {tuple(landmarks.shape)}")
     if not torch.isfinite(landmarks).all():
         raise ValueError("landmarks: all values must be finite")
+    if focal is not None and (focal.shape != landmarks.shape[:1] or bool((focal <= 0).any())):
+        raise ValueError(f"focal: need {len(landmarks)} positive numbers of pixels or NaN, got {focal.tolist()}")
     exact = head.to(torch.float64)
     K, E = len(exact.identity_basis), len(exact.expression_names)
     ids = exact.landmark_ids
@@ -102,18 +109,19 @@ def fit_landmarks(landmarks: Tensor, head: HeadModel, size: int, identity: Tenso
         normal=normalize(exact.landmarks(vertex_normals(exact.template, exact.faces)), dim=-1),
         shape_rows=(ids < FIRST_IRIS).double(),
         free=torch.tensor([name not in UNFITTED for name in exact.expression_names], dtype=torch.float64),
-        pixel_unit=torch.ones(len(landmarks), dtype=torch.float64),
+        pixel_unit=torch.ones(N, dtype=torch.float64),
+        lens=torch.full((N,), torch.nan, dtype=torch.float64) if focal is None else focal.double(),
         identity_prior=IDENTITY_PRIOR[0],
         known=identity is not None,
     )
-    rotation, translation, focal, unit = _weak_perspective(problem, eye_distance(exact))
+    rotation, translation, pixels, unit = _weak_perspective(problem, eye_distance(exact))
     problem = replace(problem, pixel_unit=unit)
     state = LandmarkFit(
         torch.zeros(K, dtype=torch.float64) if identity is None else identity.double(),
         torch.zeros(N, E, dtype=torch.float64),
         rotation,
         translation,
-        focal,
+        pixels,
         torch.zeros(N, dtype=torch.float64),
     )
     for prior, steps in zip(IDENTITY_PRIOR, STEPS, strict=True):
@@ -131,7 +139,7 @@ def eye_distance(head: HeadModel) -> float:
 
 
 def _weak_perspective(problem: _Problem, eye_distance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Start: the affine camera of the mean head by linear least squares, made a rotation at the usual distance."""
+    """Start: the affine camera of the mean head by linear least squares, made a rotation at the likely distance."""
     centre = problem.points.mean(0)
     shape = problem.points - centre
     middle = problem.target.mean(1)
@@ -140,8 +148,8 @@ def _weak_perspective(problem: _Problem, eye_distance: float) -> tuple[Tensor, T
     rows = u @ vt
     scale = s.mean(-1)
     rotation = torch.stack((rows[:, 0], rows[:, 1], torch.linalg.cross(rows[:, 0], rows[:, 1])), 1)
-    depth = torch.full_like(scale, DISTANCE)
-    focal = scale * depth
+    focal = torch.where(problem.lens.isnan(), scale * DISTANCE, problem.lens)
+    depth = focal / scale
     translation = torch.cat((middle / scale[:, None], depth[:, None]), -1) - rotation @ centre
     return rotation, translation, focal, scale * eye_distance
 
@@ -168,7 +176,9 @@ def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
     outside = state.expression - state.expression.clamp(0, 1)
     cost = (problem.weight * robust).sum() + problem.identity_prior * state.identity.square().sum()
     cost = cost + EXPRESSION_PRIOR * state.expression.square().sum() + BOUND_WEIGHT * outside.square().sum()
-    cost = cost + ((state.translation[:, 2].clamp(min=1e-3) / DISTANCE).log() / DISTANCE_SPREAD).square().sum()
+    near = (state.translation[:, 2].clamp(min=1e-3) / DISTANCE).log() / DISTANCE_SPREAD
+    wide = (state.focal / problem.lens).log() / LENS_SPREAD
+    cost = cost + torch.where(problem.lens.isnan(), near, wide).square().sum()
     behind = (camera[..., 2] <= 1e-3).any()
     return torch.where(behind, torch.full_like(cost, torch.inf), cost)
 
@@ -225,10 +235,12 @@ def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Te
     curvature = EXPRESSION_PRIOR + BOUND_WEIGHT * (outside != 0).double()
     C.diagonal(dim1=-2, dim2=-1)[:, :E].add_(curvature)
     c[:, :E] += EXPRESSION_PRIOR * state.expression + BOUND_WEIGHT * outside
-    depth = state.translation[:, 2]
-    slope = 1.0 / (DISTANCE_SPREAD * depth)
+    depth, noted = state.translation[:, 2], ~problem.lens.isnan()
+    slope = ~noted / (DISTANCE_SPREAD * depth)
     C[:, E + 5, E + 5] += slope.square()
     c[:, E + 5] += slope * (depth / DISTANCE).log() / DISTANCE_SPREAD
+    C[:, E + 6, E + 6] += noted / LENS_SPREAD**2
+    c[:, E + 6] += torch.where(noted, (state.focal / problem.lens).log() / LENS_SPREAD**2, 0.0)
     return A, B, C, a, c
 
 

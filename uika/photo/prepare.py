@@ -35,7 +35,8 @@ class Photo:
     matte [S,S] float32 in [0,1], 1 = person (hair, face, neck, shoulders), 0 outside the photo;
     landmarks [478,2] float32 in crop pixels (pixel centres at +0.5, may lie outside), mediapipe face mesh order;
     crop (x0, y0, side) of the square in the upright photo, in its pixels;
-    original [3,S,S] float32, the crop with its own background.
+    original [3,S,S] float32, the crop with its own background;
+    focal length in crop pixels if the file tells it.
     """
 
     path: str
@@ -45,6 +46,7 @@ class Photo:
     landmarks: Tensor
     crop: Square
     original: Tensor
+    focal: float | None = None
 
 
 def prepare(path: str | Path, size: int = 512, background: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Photo:
@@ -84,6 +86,7 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
         landmarks=torch.from_numpy(landmarks.astype(np.float32)),
         crop=square,
         original=_chw(plain + inside[..., None] * (crop.astype(np.float32) / 255 - plain)),
+        focal=None if picture.focal is None else picture.focal * size / square[2],
     )
 
 

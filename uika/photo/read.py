@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.photo.error import PhotoError
+from uika.photo.lens import focal_length
 
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 512 * 1024 * 1024
@@ -26,13 +27,14 @@ class Picture:
     """Pixels of a photo file, turned upright.
 
     rgb [H,W,3] uint8 sRGB, not multiplied by alpha; alpha [H,W] uint8, or None when the file is opaque;
-    path as given; sha256 of the file's bytes.
+    path as given; sha256 of the file's bytes; focal length in pixels if the camera noted it.
     """
 
     path: str
     sha256: str
     rgb: NDArray[np.uint8]
     alpha: NDArray[np.uint8] | None
+    focal: float | None = None
 
 
 def read(path: str | Path) -> Picture:
@@ -45,8 +47,8 @@ def read(path: str | Path) -> Picture:
     data = _read_bytes(Path(path))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow warns of bombs, odd palettes and odd EXIF: judged below or harmless
-        rgb, alpha = _decode(path, data)
-    return Picture(str(path), hashlib.sha256(data).hexdigest(), rgb, alpha)
+        rgb, alpha, focal = _decode(path, data)
+    return Picture(str(path), hashlib.sha256(data).hexdigest(), rgb, alpha, focal)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -68,7 +70,7 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, float | None]:
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     formats = FORMATS if _register_heif() else FORMATS[:-1]
@@ -76,8 +78,9 @@ def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[n
         with Image.open(io.BytesIO(data), formats=formats) as image:
             _check_size(path, *image.size)
             image.load()
+            focal = focal_length(image)
             ImageOps.exif_transpose(image, in_place=True)  # a copy of 64 megapixels takes 256 MiB
-            return _to_arrays(image)
+            return *_to_arrays(image), focal
     except PhotoError:
         raise
     except Image.DecompressionBombError as error:
