@@ -29,6 +29,7 @@ EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows 
 EAR_RINGS, EAR_ROUNDS = 3, 80
 FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
 HANGING_LOSS = 0.02  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
+TURN_POWER = 64  # of the cosine of a face's turn: half the trust at 8 degrees, next to none from 30
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
 
@@ -55,37 +56,45 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
     region = _region(head, edges)
     centres = _centres(head, parameters, cameras)
     reach = torch.stack([_reach(matte, at[0]) for matte, at in zip(mattes, centres, strict=True)])
+    trust = _trust(cameras)
     canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
     normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
     bald = pose_vertices(head, parameters)
 
-    def lift(flat: Tensor) -> Tensor:
+    def lift(flat: Tensor, trust: Tensor) -> Tensor:
         still = flat[:, 1] < -FALLEN
         height = torch.zeros(len(head.template))
         for _ in range(ROUNDS):
             # The cameras carry the pose, so the offset simply adds to the posed head.
             vertices = bald + flat + height[:, None] * normals
-            wanted, pull = _outline_demand(head, vertices, cameras, centres, reach, region)
+            wanted, pull = _outline_demand(head, vertices, cameras, centres, reach, trust, region)
             pull = pull * ~still[region.vertices]
             height = _membrane(region, height, wanted, pull)
         return height
 
-    def whole(hanging: Tensor, hangs: bool) -> Tensor:
-        height = lift(hanging)
-        flat = _covered_ears(head, canonical, height, edges, hangs)
+    def whole(hanging: Tensor, trust: Tensor) -> Tensor:
+        height = lift(hanging, trust)
+        flat = _covered_ears(head, canonical, height, edges, bool((hanging != 0).any()))
         if bool((flat != 0).any()):
-            height = lift(hanging + flat)
+            height = lift(hanging + flat, trust)
         offset = flat + height[:, None] * normals
         return hanging + offset * (MAX_OFFSET / offset.norm(dim=-1, keepdim=True).clamp(min=MAX_OFFSET))
 
-    offset = whole(torch.zeros_like(canonical), False)
-    hanging = hanging_hair(head, bald, cameras, mattes)
-    if not bool((hanging != 0).any()):
-        return offset
-    # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any outline.
-    down = whole(hanging, True)
-    standing, fallen = (overlap(head, bald + each, cameras, mattes) for each in (offset, down))
-    return down if fallen > standing - HANGING_LOSS else offset
+    stands, hangs = torch.zeros_like(canonical), hanging_hair(head, bald, cameras, mattes)
+    if bool((hangs != 0).any()):
+        # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any
+        # outline. Every photo has a say in this.
+        each = (whole(start, torch.ones(len(bald))) for start in (stands, hangs))
+        standing, fallen = (overlap(head, bald + offset, cameras, mattes) for offset in each)
+        if fallen > standing - HANGING_LOSS:
+            return whole(hangs, trust)
+    return whole(stands, trust)
+
+
+def _trust(cameras: Camera) -> Tensor:
+    """How far each photo [N] is believed, at most 1: the more a face is turned, the worse its camera is known."""
+    facing = (1 - cameras.viewmat[:, 2, :2].square().sum(-1)).clamp(min=0)
+    return (facing / facing.max()) ** (TURN_POWER / 2)
 
 
 def _covered_ears(head: HeadModel, canonical: Tensor, height: Tensor, edges: Tensor, hanging: bool) -> Tensor:
@@ -188,7 +197,13 @@ def _reach(matte: Tensor, centre: Tensor) -> Tensor:
 
 
 def _outline_demand(
-    head: HeadModel, vertices: Tensor, cameras: Camera, centres: Tensor, reach: Tensor, region: _Region
+    head: HeadModel,
+    vertices: Tensor,
+    cameras: Camera,
+    centres: Tensor,
+    reach: Tensor,
+    trust: Tensor,
+    region: _Region,
 ) -> tuple[Tensor, Tensor]:
     """How far each region vertex should move along its normal [R] in metres, and how strongly [R], over all photos."""
     pixels, depth = project(vertices, cameras)
@@ -207,7 +222,7 @@ def _outline_demand(
     outward = (normals[..., :2] * ray / radius[..., None]).sum(-1)
     at = (radius > OUTLINE_SHARE * spread.gather(1, sector)) & (outward > 0.3) & gap.isfinite()
     metres = gap.nan_to_num() * depth / cameras.K[..., 0, 0][:, None] / outward.clamp(min=0.5)
-    weight = at.float()
+    weight = at * trust[:, None]
     total = weight.sum(0).clamp(min=1e-9)
     wanted = (weight * metres).sum(0) / total
     return wanted[region.vertices], weight.sum(0)[region.vertices] * region.share

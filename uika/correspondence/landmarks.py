@@ -38,6 +38,7 @@ DISTANCE, DISTANCE_SPREAD = 1.1, 0.35  # metres and log-spread: focal length and
 LENS_SPREAD = 0.05  # log-spread of focal lengths that cameras note
 STEPS = (12, 18)
 MAX_DAMPING = 1e9
+TURN_POWER = 3  # of the cosine of a face's turn, by which photos count
 HIDDEN, FACING, HIDDEN_TRUST = 0.0, 0.6, 0.1  # cosines of the viewing angle between which a landmark gains trust
 
 
@@ -163,10 +164,15 @@ def _project(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Tensor]:
 
 
 def _facing(problem: _Problem, state: LandmarkFit) -> Tensor:
-    """Trust [N,L] by viewing angle: the detector guesses what is turned away, and its guesses are biased."""
+    """Trust [N,L] by viewing angle: the detector guesses what is turned away, and its guesses are biased.
+
+    Photos are compared with the most frontal one, so that a lone photo is believed.
+    """
     _, camera = _project(problem, state)
     cosine = -(problem.normal @ state.rotation.mT * normalize(camera, dim=-1)).sum(-1)
-    return ((cosine - HIDDEN) / (FACING - HIDDEN)).clamp(HIDDEN_TRUST, 1.0).square()
+    frontal = state.rotation[:, 2, 2].abs()
+    photo = (frontal / frontal.max()) ** TURN_POWER
+    return ((cosine - HIDDEN) / (FACING - HIDDEN)).clamp(HIDDEN_TRUST, 1.0).square() * photo[:, None]
 
 
 def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
