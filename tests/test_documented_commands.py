@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -109,9 +110,10 @@ def test_long_command_starts(command: str, folder: Path, tmp_path: Path) -> None
     absent = [word for word in words if word.endswith(".safetensors") and not (folder / word).exists()]
     if absent or "--video 0" in command:
         pytest.skip(f"needs {absent[0] if absent else 'a camera'}")
-    if "--data held_out" in command and not (folder / "held_out").exists():
+    data = dict(pairwise(words)).get("--data", "synthetic")
+    if data != "synthetic" and not (folder / data).exists():
         few = ["--identities", "2", "--views", "3", "--frames", "4", "--size", "128"]
-        assert main(["synthesize", "-o", str(folder / "held_out"), *few]) == 0
+        assert main(["synthesize", "-o", str(folder / data), *few]) == 0
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     arguments = [sys.executable, "-m", *words]
     if command.startswith("uika synthesize"):
