@@ -24,8 +24,10 @@ def save(path: Path, size: tuple[int, int], focal: object = None, noted: tuple[o
     return path
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "heic"])
 def test_equivalent_focal_lengths_compare_diagonals(tmp_path: Path, suffix: str) -> None:
+    if suffix == "heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
     # A phone's main camera: 26 mm equivalent, 4032 x 3024 pixels, scaled to a tenth.
     found = read(save(tmp_path / f"a.{suffix}", (403, 302), 26, (4032, 3024))).focal
     assert found == pytest.approx(26 / 43.27 * 503.6, rel=1e-3)
