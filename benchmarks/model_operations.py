@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     text = (
         f"Preset `{options.preset}`, {options.kept:.0%} of the patches are foreground. Seconds are computed from the "
-        f"measured rates of matrix products and of attention, {speeds}; no such run was timed.\n\n{markdown(rows)}"
+        f"measured rates of matrix products and of attention, {speeds}; they were not timed.\n\n{markdown(rows)}"
     )
     save(options.name, "Network: operations", text, {"rows": rows})
     curves = {run: [(row["views"], row[f"{run} s"]) for row in rows] for run in RUNS}
