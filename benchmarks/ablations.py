@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from uika.head import load_head
 from uika.metrics import flip, psnr, ssim
 from uika.model import PRESETS, load_checkpoint

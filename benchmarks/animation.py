@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.rasterizer_common import RESULTS, interleaved, machine, markdown, save
+from benchmarks.harness import RESULTS, interleaved, machine, markdown, save
 from drjit_splat.profiling import profile
 from uika.acting import get_motion
 from uika.avatar import Avatar

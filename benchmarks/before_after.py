@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from benchmarks.rasterizer_common import RESULTS
+from benchmarks.harness import RESULTS
 from uika.commands import PORTRAIT
 from uika.files import replacing
 from uika.head import HeadParameters, load_head

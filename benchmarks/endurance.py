@@ -12,7 +12,7 @@ import random
 import resource
 from pathlib import Path
 
-from benchmarks.rasterizer_common import RESULTS, markdown, save
+from benchmarks.harness import RESULTS, markdown, save
 from drjit_splat import profile, rasterization
 from tests.avatars import painted_avatar
 from tests.drjit_splat.common import random_scene

@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from drjit_splat import load_ply, rasterization, save_ply
 from tests.chromium import page
 from tests.drjit_splat.common import random_scene

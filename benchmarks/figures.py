@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from benchmarks.rasterizer_common import RESULTS
+from benchmarks.harness import RESULTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.figures import lines
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from uika.correspondence import Fit, LandmarkFit, fit_landmarks, pixel_uv
 from uika.correspondence.detector import unbiased
 from uika.correspondence.refine import refine_landmark_fit

@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.rasterizer_common import RESULTS, machine
+from benchmarks.harness import RESULTS, machine
 from scenes import compare_splats
 from scenes import render as render_mesh
 from uika.avatar import Avatar

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from uika.avatar import Avatar
 from uika.data import Capture
 from uika.evaluate.heads import drive, observe_sources, target_views, truth_picture

@@ -17,7 +17,7 @@ import numpy as np
 
 import scenes
 from benchmarks.figures import lines
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets

@@ -25,8 +25,8 @@ from safetensors.torch import load_file
 from torch import nn
 
 from benchmarks.figures import lines
+from benchmarks.harness import save
 from benchmarks.model_inputs import Views, make_views
-from benchmarks.rasterizer_common import save
 from uika.files import write_tensors
 from uika.head import HeadParameters
 from uika.metrics import psnr

@@ -18,7 +18,7 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.figures import lines
-from benchmarks.rasterizer_common import interleaved, markdown, save
+from benchmarks.harness import interleaved, markdown, save
 from uika.head import load_head, uv_texels
 from uika.model import ESTIMATORS, PRESETS, Estimator, Reconstructor, SurfaceTexels
 from uika.model.features import covered_tokens

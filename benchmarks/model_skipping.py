@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.figures import bars
+from benchmarks.harness import interleaved, markdown, save
 from benchmarks.learned import frames_of
 from benchmarks.model_inputs import PORTRAIT, make_views
-from benchmarks.rasterizer_common import interleaved, markdown, save
 from uika.avatar import Avatar
 from uika.correspondence import Fit, pixel_uv
 from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture

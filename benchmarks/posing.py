@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.rasterizer_common import RESULTS, markdown, save
+from benchmarks.harness import RESULTS, markdown, save
 from uika.acting import expression_vector
 from uika.avatar import Avatar
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels

@@ -14,7 +14,7 @@ import torch
 
 from benchmarks import pair_oracle
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from benchmarks.splat_scenes import QUICK, Scene, named_scene
 from drjit_splat import rasterization
 from tests.drjit_splat.common import compare, random_scene

@@ -17,7 +17,7 @@ import drjit as dr
 import torch
 
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from benchmarks.splat_scenes import Scene, head_scene
 from drjit_splat import profile, rasterization
 from examples import fit_image_torch

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 
 from benchmarks import pair_oracle
-from benchmarks.rasterizer_common import RESULTS, interleaved, markdown, save
+from benchmarks.harness import RESULTS, interleaved, markdown, save
 from benchmarks.splat_scenes import NAMES, QUICK, named_scene
 from drjit_splat import Options, rasterization
 

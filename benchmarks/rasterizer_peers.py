@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks import pair_oracle, torch_baseline
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import interleaved, markdown, save
+from benchmarks.harness import interleaved, markdown, save
 from benchmarks.splat_scenes import NAMES, QUICK, Scene, named_scene
 from drjit_splat import rasterization
 from drjit_splat.llvm import require

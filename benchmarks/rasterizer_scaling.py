@@ -14,7 +14,7 @@ from dataclasses import replace
 import drjit as dr
 import torch
 
-from benchmarks.rasterizer_common import RESULTS, fastest_fma, interleaved, markdown, save
+from benchmarks.harness import RESULTS, fastest_fma, interleaved, markdown, save
 from benchmarks.rasterizer_table import BACKWARD_FLOP, FORWARD_FLOP
 from benchmarks.splat_scenes import Scene, head_scene, passes
 from drjit_splat import rasterization

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import interleaved, markdown, save
+from benchmarks.harness import interleaved, markdown, save
 from benchmarks.splat_scenes import Scene, named_scene
 from drjit_splat import Options, prepare, rasterization
 

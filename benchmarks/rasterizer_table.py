@@ -16,7 +16,7 @@ import torch
 
 from benchmarks import torch_baseline
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import Timing, fastest_fma, interleaved, markdown, save
+from benchmarks.harness import Timing, fastest_fma, interleaved, markdown, save
 from benchmarks.splat_scenes import NAMES, QUICK, Scene, named_scene, passes
 from drjit_splat import profile, rasterization
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.lighting import sample_lighting
 from scenes.people import paint, sample_person

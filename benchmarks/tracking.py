@@ -22,7 +22,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.rasterizer_common import RESULTS, markdown, save
+from benchmarks.harness import RESULTS, markdown, save
 from benchmarks.splat_scenes import PORTRAIT
 from uika.acting import get_motion
 from uika.avatar import Avatar

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.rasterizer_common import RESULTS, markdown, save
+from benchmarks.harness import RESULTS, markdown, save
 from uika.train.logbook import STAGES, read_log
 
 SAVE_EVERY = 10

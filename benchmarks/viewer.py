@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from tests.chromium import Page, page
 from uika.acting import get_motion
 from uika.avatar import Avatar

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.figures import bars
-from benchmarks.rasterizer_common import markdown, save
+from benchmarks.harness import markdown, save
 from benchmarks.splat_scenes import PORTRAIT
 from uika import Avatar, get_motion, load_head
 from uika.filming import film
