@@ -18,9 +18,9 @@ import numpy as np
 import scenes
 from benchmarks.figures import lines
 from benchmarks.harness import markdown, save
-from scenes.deferred import Shader, as_texture, lit_stage
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
+from scenes.synthesis.deferred import Shader, as_texture, lit_stage
 from uika.head import HeadParameters, load_head, look_at, pose_vertices
 
 SAMPLES = (1, 4, 16, 64, 256)

@@ -18,10 +18,10 @@ import numpy as np
 
 from benchmarks.figures import bars
 from benchmarks.harness import markdown, save
-from scenes.deferred import Shader, as_texture, lit_stage
-from scenes.lighting import sample_lighting
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
+from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+from scenes.synthesis.lighting import sample_lighting
 from uika.data import Synthesis, synthesize
 from uika.data.encode import DEPTH_UNIT, UV_STEPS, encode_pixels, encode_uv
 from uika.data.identity import texture_size

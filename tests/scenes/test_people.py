@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import scenes
-from scenes.deferred import Shader, as_texture, lit_stage
-from scenes.lighting import backdrop, sample_lighting
 from scenes.people import GlassesStyle, paint, sample_person, wear_glasses
 from scenes.people.hair import hair_offsets
 from scenes.people.person import CUTS
+from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+from scenes.synthesis.lighting import backdrop, sample_lighting
 from tests.heads import sphere_head
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_vertices
 

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from scenes import linear_to_srgb
-from scenes.lighting import sample_lighting
-from scenes.shading import pixel_pattern
+from scenes.synthesis.lighting import sample_lighting
+from scenes.synthesis.shading import pixel_pattern
 from tests.heads import sphere_head
 from uika.head import Camera, look_at
 
@@ -36,7 +36,7 @@ def test_lamps_of_every_seed_can_be_drawn() -> None:
 
 
 def test_stored_views_are_the_single_views_rounded() -> None:
-    from scenes.deferred import Shader, as_texture, lit_stage
+    from scenes.synthesis.deferred import Shader, as_texture, lit_stage
 
     head = sphere_head()
     texture = as_texture(np.random.default_rng(0).random((16, 16, 3)), np.full((16, 16), 0.5))

@@ -17,7 +17,7 @@ from uika.data.performance import perform, place_camera, viewpoints
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, shaped_vertices, vertex_normals
 
 if TYPE_CHECKING:
-    from scenes.deferred import StoredView
+    from scenes.synthesis.deferred import StoredView
 
 _SPP = 4
 _LIGHT_SAMPLES = (32, 64)  # for each vertex, in images below and from 256 pixels on
@@ -35,10 +35,10 @@ def generate_identity(
     All depends on the arguments alone. The folder holds `transforms.json` and parameter files as VHAP exports them, and
     beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`).
     """
-    from scenes.deferred import Shader, as_texture, lit_stage
-    from scenes.lighting import backdrop, sample_lighting
     from scenes.people import paint, sample_person, wear_glasses
     from scenes.people.hair import hair_offsets
+    from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+    from scenes.synthesis.lighting import backdrop, sample_lighting
 
     person = sample_person(int(_random(seed, identity, "person").integers(2**31)), head)
     lighting = sample_lighting(_random(seed, identity, "light"))
@@ -112,7 +112,7 @@ def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.
 
 def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor, seed: int) -> float:
     """Mean radiance of a white, resting face."""
-    from scenes.deferred import gather_light
+    from scenes.synthesis.deferred import gather_light
 
     stage.pose(head, vertices)
     face = (head.masks["face"] > 0.5).nonzero()[:, 0]

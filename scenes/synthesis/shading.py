@@ -1,4 +1,4 @@
-"""The highlight model, transfer curve and sample patterns of `scenes.deferred`."""
+"""The highlight model, transfer curve and sample patterns of `scenes.synthesis.deferred`."""
 
 from __future__ import annotations
 

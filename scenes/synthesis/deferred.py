@@ -18,10 +18,10 @@ import torch
 
 from scenes.arrays import aligned, flat
 from scenes.people.glasses import Glasses, glasses_topology
-from scenes.shading import encode_srgb, highlight, pixel_pattern, plane_points
 from scenes.stage import Light, Stage, load_stage
+from scenes.synthesis.shading import encode_srgb, highlight, pixel_pattern, plane_points
+from scenes.synthesis.wave import Wave, waves
 from scenes.variant import FAST_VARIANT, load_mitsuba
-from scenes.wave import Wave, waves
 from uika.head import Camera, HeadModel, vertex_normals
 
 LABELS = ("uv", "depth", "normal", "triangle")

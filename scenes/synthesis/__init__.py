@@ -1,0 +1,1 @@
+"""How synthetic people are shaded and lit for training data."""
