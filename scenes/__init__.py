@@ -1,10 +1,10 @@
 """Mitsuba reference renders of the parametric head; importing this package does not load Mitsuba."""
 
 from scenes.colour import linear_to_srgb, srgb_to_linear
-from scenes.compare import SplatReport, compare_splats
 from scenes.exr import read_exr, write_exr, write_png
-from scenes.render import AOVS, render
+from scenes.reference_render import AOVS, render
 from scenes.splats import register_plugins
+from scenes.validation.compare import SplatReport, compare_splats
 from scenes.variant import load_mitsuba
 
 __all__ = [

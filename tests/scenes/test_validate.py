@@ -4,9 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.gradients import GradientReport
-from scenes.report import write_report
-from scenes.validate import LIMITS, ViewReport, depth_normals, main, validate
+from scenes.validation.__main__ import main, validate
+from scenes.validation.gradients import GradientReport
+from scenes.validation.report import write_report
+from scenes.validation.views import LIMITS, ViewReport, depth_normals
 from uika.head import load_head, look_at
 
 BUILT_IN = pytest.mark.skipif("UIKA_HEAD" in os.environ, reason="skipped: another head is chosen")

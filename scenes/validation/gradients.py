@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scenes.reference_render import render
+from scenes.validation.splat_head import splat_head, texture
 from uika.head import Camera, HeadModel, HeadParameters, look_at, pose_vertices
 
 NAMES = ("camera yaw", "jaw angle", "expression")
@@ -45,9 +47,6 @@ class GradientReport:
 
 def compare_gradients(head: HeadModel) -> GradientReport:
     """Differentiate the mean square difference of two flat-lit images of a head by yaw, jaw and an expression."""
-    from scenes.render import render
-    from scenes.validate import splat_head, texture
-
     paint = texture()
     names = list(head.expression_names)
     action = names.index("mouthSmileLeft") if "mouthSmileLeft" in names else 0

@@ -11,8 +11,8 @@ import numpy as np
 
 from scenes.colour import linear_to_srgb
 from scenes.exr import write_png
-from scenes.gradients import NAMES, GradientReport
-from scenes.validate import LIMITS, Pictures, ViewReport
+from scenes.validation.gradients import NAMES, GradientReport
+from scenes.validation.views import LIMITS, Pictures, ViewReport
 from uika.files import replacing
 
 Result = tuple[list[ViewReport], GradientReport, Pictures]

@@ -1,0 +1,1 @@
+"""Splats compared with Mitsuba: coverage, depth, normals, correspondences, colours and gradients."""
