@@ -17,9 +17,9 @@ import torch
 
 from benchmarks.harness import markdown, save
 from uika.head import load_head
+from uika.io.progress import counted
 from uika.metrics import flip, psnr, ssim
 from uika.model import PRESETS, load_checkpoint
-from uika.progress import counted
 from uika.train import MODEL_FILE, TRAINING, Group, Setup, Stored, TrainConfig, train
 from uika.train.items import ItemMaker
 from uika.train.sampler import Draw

@@ -24,10 +24,10 @@ from uika.avatar import Avatar
 from uika.commands import PORTRAIT
 from uika.filming import Stage, film
 from uika.head import HeadModel, load_head
+from uika.io.video import to_bytes
 from uika.motion import Motion
 from uika.reconstruction import reconstruct
 from uika.rendering import frames, motion_cameras
-from uika.video import to_bytes
 
 SIZES = (256, 512, 1024)
 THINNING = (1, 2, 4, 8)

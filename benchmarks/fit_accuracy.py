@@ -24,8 +24,8 @@ from benchmarks.harness import markdown, save
 from uika.correspondence import Fit, LandmarkFit, fit_landmarks, pixel_uv
 from uika.correspondence.detector import unbiased
 from uika.correspondence.refine import refine_landmark_fit
-from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
+from uika.io.files import replacing
 
 SIZE, TEXELS = 384, 384
 VIEWS = (1, 2, 4, 8)

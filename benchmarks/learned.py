@@ -24,7 +24,7 @@ from uika.evaluate.protocol import TURNED_AWAY, Protocol
 from uika.evaluate.score import Judges, Pictures, mean, score
 from uika.evaluate.sequences import facing
 from uika.head import HeadModel, load_head, uv_texels
-from uika.progress import counted
+from uika.io.progress import counted
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, load_model
 from uika.surface import surface_texels
 from uika.train.crops import View

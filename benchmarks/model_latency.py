@@ -27,8 +27,8 @@ from torch import nn
 from benchmarks.figures import lines
 from benchmarks.harness import save
 from benchmarks.model_inputs import Views, make_views
-from uika.files import write_tensors
 from uika.head import HeadParameters
+from uika.io.files import write_tensors
 from uika.metrics import psnr
 from uika.model import (
     ESTIMATORS,

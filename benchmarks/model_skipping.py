@@ -32,13 +32,13 @@ from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
 from uika.growing import GrowingAvatar
 from uika.head import HeadModel, HeadParameters, load_head
+from uika.io.video import write_png
 from uika.metrics import psnr
 from uika.model import CanonicalGaussians, Keep, Reconstructor, Session
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
 from uika.rendering import render
 from uika.train.crops import View
 from uika.train.people import find_people
-from uika.video import write_png
 
 SIZE = 256  # pixels of people's photos and of the pictures that are compared
 TARGETS = 8

@@ -7,7 +7,7 @@ import torch
 from uika.acting import expression_vector
 from uika.convert.embed import paint, shade
 from uika.head import HeadModel, HeadParameters, look_at, pose_vertices
-from uika.video import write_video
+from uika.io.video import write_video
 
 GAP = range(10, 14)
 FPS = 25.0

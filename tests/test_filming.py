@@ -8,8 +8,8 @@ from uika import Avatar, HeadModel, frames, get_motion, neutral_camera
 from uika.avatar import AvatarError
 from uika.filming import film
 from uika.head import load_head
+from uika.io.video import to_bytes
 from uika.motion import Motion
-from uika.video import to_bytes
 
 SIZE = 96
 

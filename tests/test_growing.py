@@ -7,10 +7,10 @@ from benchmarks.head_quality import PORTRAIT
 from tests.agreement import assert_same_avatar
 from uika import GrowingAvatar, HeadModel, UikaError, load_head, reconstruct
 from uika.head import HeadParameters
+from uika.io.video import write_png
 from uika.photo import PhotoError
 from uika.reconstruction import Report
 from uika.rendering import neutral_camera, render
-from uika.video import write_png
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from uika import (
     write_png,
     write_video,
 )
+from uika.io.video import to_bytes
 from uika.rendering import motion_cameras
 from uika.sheet import contact_sheet
-from uika.video import to_bytes
 
 SIZE = 96
 

@@ -26,7 +26,6 @@ from scenes.synthesis.lighting import backdrop, sample_lighting
 from uika.correspondence.detector import BIAS_PATH, upright, view_polynomials
 from uika.correspondence.landmarks import MESH_POINTS, eye_distance
 from uika.data.performance import perform
-from uika.files import replacing
 from uika.head import (
     Camera,
     HeadModel,
@@ -38,6 +37,7 @@ from uika.head import (
     shaped_vertices,
     vertex_normals,
 )
+from uika.io.files import replacing
 from uika.photo.nets import face_meshes
 
 SIZE = 512

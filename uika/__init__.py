@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from uika.errors import UikaError
     from uika.growing import GrowingAvatar
     from uika.head import Camera, HeadModel, HeadParameters, load_head
+    from uika.io.video import write_png, write_video
     from uika.motion import Motion, MotionError, load_motion
     from uika.reconstruction import Reconstruction, reconstruct
     from uika.rendering import Rendering, frames, neutral_camera, render
-    from uika.video import write_png, write_video
 
 _HOMES = {
     "Avatar": "avatar",
@@ -40,8 +40,8 @@ _HOMES = {
     "neutral_camera": "rendering",
     "reconstruct": "reconstruction",
     "render": "rendering",
-    "write_png": "video",
-    "write_video": "video",
+    "write_png": "io.video",
+    "write_video": "io.video",
 }
 
 __all__ = [

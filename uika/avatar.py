@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from uika.errors import UikaError
-from uika.files import write_tensors
 from uika.head import (
     Binding,
     HeadModel,
@@ -22,6 +21,7 @@ from uika.head import (
     shaped_vertices,
     skin_points,
 )
+from uika.io.files import write_tensors
 
 FORMAT = "uika-avatar"
 VERSION = "1"

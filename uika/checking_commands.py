@@ -36,7 +36,7 @@ class Weights:
 
     def run(self) -> int:
         """Print the list; nothing is fetched."""
-        from uika.weights import FOLDER_VARIABLE, check_weights, folder
+        from uika.io.weights import FOLDER_VARIABLE, check_weights, folder
 
         print(f"weights lie in {folder()} ({FOLDER_VARIABLE} names another folder); nothing is fetched by itself")
         found = check_weights(verify=self.verify)

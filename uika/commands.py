@@ -14,7 +14,7 @@ from uika.checking_commands import Doctor, Weights
 from uika.errors import UikaError
 from uika.evaluate_command import Evaluate
 from uika.export_command import Export
-from uika.files import check_folder, check_output
+from uika.io.files import check_folder, check_output
 from uika.motion_commands import Head, Track
 from uika.synthesize_command import Synthesize
 from uika.train_command import Train
@@ -96,9 +96,9 @@ class Animate:
         from uika.avatar import Avatar
         from uika.filming import film
         from uika.head import load_head
+        from uika.io.video import check_even, write_video
         from uika.rendering import check_renderer, check_view
         from uika.safeguards import mark, picture_provenance
-        from uika.video import check_even, write_video
 
         check_view(0.0, 0.0, check_even(self.size))
         avatar, head = Avatar.load(self.avatar), load_head()
@@ -149,9 +149,9 @@ class Render:
         target = check_output(self.output, ".png")
         from uika.avatar import Avatar
         from uika.head import HeadParameters, load_head
+        from uika.io.video import write_png
         from uika.rendering import check_renderer, check_view, neutral_camera, render
         from uika.safeguards import mark, picture_provenance
-        from uika.video import write_png
 
         check_view(self.yaw, self.pitch, self.size)
         avatar, head = Avatar.load(self.avatar), load_head()
@@ -185,11 +185,11 @@ class Demo:
         from uika.acting import get_motion
         from uika.filming import film
         from uika.head import load_head
+        from uika.io.video import write_png, write_video
         from uika.reconstruction import reconstruct
         from uika.rendering import check_renderer
         from uika.safeguards import mark, picture_provenance, stamped
         from uika.sheet import reconstruction_sheet
-        from uika.video import write_png, write_video
 
         check_renderer()
         head = load_head()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from uika.errors import UikaError
-from uika.files import check_folder, check_output
+from uika.io.files import check_folder, check_output
 
 if TYPE_CHECKING:
     from uika.avatar import Avatar

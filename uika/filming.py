@@ -15,8 +15,9 @@ from uika.avatar import Avatar
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices
 from uika.head.binding import rigid_turn
 from uika.head.posing import rest_joints
+from uika.io.progress import counted
 from uika.motion import Motion
-from uika.rendering import counted, motion_cameras
+from uika.rendering import motion_cameras
 
 if TYPE_CHECKING:
     from drjit_splat.pictures import Exposure, Picture

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npz
 from uika.errors import UikaError
-from uika.files import check_output, replacing
 from uika.head import HeadModel, HeadParameters
+from uika.io.files import check_output, replacing
+from uika.io.npz import ArraysError, read_npz
 
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 _CAMERA = ("yaw", "pitch")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from uika.files import check_output
+from uika.io.files import check_output
 
 if TYPE_CHECKING:
     from uika.head import HeadModel

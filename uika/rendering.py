@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.errors import UikaError, install_command
+from uika.errors import UikaError
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at
+from uika.io.progress import counted
 from uika.motion import Motion
 
 MIN_SIZE, MAX_SIZE = 16, 4096  # pixels, of a picture's side
@@ -176,15 +177,3 @@ def check_renderer() -> None:
         require()
     except RuntimeError as error:
         raise UikaError(str(error)) from error
-
-
-def counted(count: int, progress: bool) -> Iterable[int]:
-    """The numbers of the frames, with a progress bar on stderr if asked for."""
-    if not progress:
-        return range(count)
-    try:
-        from tqdm import tqdm
-    except ModuleNotFoundError as error:
-        raise UikaError(f"the progress bar needs tqdm; run: {install_command('tqdm')}") from error
-    bar: Any = tqdm(range(count), desc="frames", unit="frame", leave=False, disable=None)
-    return bar

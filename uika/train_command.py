@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from uika.errors import UikaError
-from uika.files import check_folder
+from uika.io.files import check_folder
 
 OVERFIT_GOAL = 35.0  # dB
 

@@ -13,7 +13,7 @@ from scenes.colour import linear_to_srgb
 from scenes.exr import write_png
 from scenes.validation.gradients import NAMES, GradientReport
 from scenes.validation.views import LIMITS, Pictures, ViewReport
-from uika.files import replacing
+from uika.io.files import replacing
 
 Result = tuple[list[ViewReport], GradientReport, Pictures]
 _STYLE = (

@@ -20,9 +20,9 @@ from uika.evaluate.external import external_file
 from uika.evaluate.heads import truth_picture
 from uika.evaluate.sequences import choose_frames
 from uika.head import load_head
+from uika.io.video import write_png
 from uika.metrics.arcface import SIDE
 from uika.train.crops import View
-from uika.video import write_png
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from torch import Tensor
 from tests.avatars import painted_avatar
 from uika import HeadModel, load_head, neutral_camera, render, write_video
 from uika.head import HeadParameters
+from uika.io.video import to_bytes
 from uika.metrics import psnr
 from uika.safeguards import detect, mark
 from uika.safeguards.watermark import THRESHOLD, pattern
-from uika.video import to_bytes
 
 
 @pytest.fixture(scope="module")

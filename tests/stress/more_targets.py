@@ -16,10 +16,10 @@ from PIL import Image
 from drjit_splat.cli import load_camera
 from tests.drjit_splat.common import random_scene
 from uika.export import Splats, read_glb, read_splat, write_glb, write_splat
+from uika.io.video import write_video
 from uika.model import PRESETS, CheckpointError, Reconstructor, load_checkpoint, save_checkpoint
 from uika.safeguards import verify
 from uika.tracking.decode import VideoError, decode, frame_rate
-from uika.video import write_video
 
 from . import mutate
 

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uika.arrays import ArraysError, read_npz
 from uika.avatar import Avatar, AvatarError
 from uika.data import DataError, open_capture, read_shard
 from uika.exchange import read_json
 from uika.head.unpickle import UnpickleError, read_arrays
+from uika.io.npz import ArraysError, read_npz
 from uika.motion import MotionError
 
 from .fuzz import fuzz

@@ -15,10 +15,10 @@ import torch
 from drjit_splat.cli import load_camera
 from uika.errors import UikaError
 from uika.export import glb_provenance, html_provenance, read_glb
+from uika.io.video import write_video
 from uika.model import CheckpointError, load_checkpoint
 from uika.safeguards import verify
 from uika.tracking.decode import decode, frame_rate
-from uika.video import write_video
 
 from .targets import TARGETS
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from uika.io.video import write_video
 from uika.tracking.decode import VideoError, decode, decode_ahead
-from uika.video import write_video
 
 
 @pytest.fixture(scope="module")

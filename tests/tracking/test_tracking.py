@@ -15,10 +15,10 @@ from uika.convert.embed import nearest
 from uika.exchange import read_motion
 from uika.head import HeadModel, load_head, pose_vertices, rodrigues
 from uika.head.flame import read_flame
+from uika.io.video import write_video
 from uika.motion import load_motion
 from uika.tracking import VideoError, track_video
 from uika.transfer import transfer
-from uika.video import write_video
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from uika.convert.embed import embed, eyeballs, paint
 from uika.convert.regions import region_masks
-from uika.files import check_output, replacing
 from uika.head import HeadError, HeadModel, save_head
 from uika.head.flame import read_flame
 from uika.head.unpickle import UnpickleError, read_arrays
+from uika.io.files import check_output, replacing
 
 # Mask of ours -> index lists of the FLAME masks file that make it up.
 _FLAME_MASKS = {

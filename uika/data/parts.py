@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npz
 from uika.data.encode import decode_colour, decode_depth, decode_mask, decode_uv
 from uika.data.sample import DataError, Sample
 from uika.errors import UikaError
 from uika.head import Camera, HeadParameters
+from uika.io.npz import ArraysError, read_npz
 
 _POSE = {"rotation": ("rotation", 3), "neck": ("neck_pose", 3), "jaw": ("jaw_pose", 3), "eyes": ("eyes_pose", 6)}
 

@@ -13,7 +13,7 @@ import numpy as np
 from uika.data.capture import parse_frame
 from uika.data.parts import build_sample, read_arrays
 from uika.data.sample import DataError, Sample
-from uika.files import replacing
+from uika.io.files import replacing
 
 # Key of a frame's description -> extension of its file in a shard.
 EXTENSIONS = {

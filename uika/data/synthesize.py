@@ -13,8 +13,8 @@ from typing import Any
 from uika.data.identity import generate_identity
 from uika.data.shards import EXTENSIONS, write_shard
 from uika.errors import UikaError, install_command
-from uika.files import check_folder, replacing
 from uika.head import HeadModel, load_head
+from uika.io.files import check_folder, replacing
 
 SETTINGS_FILE = "synthesis.json"
 _LIMITS = {"identities": 1_000_000, "views": 64, "frames": 1000, "size": 2048}

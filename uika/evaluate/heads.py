@@ -17,8 +17,9 @@ from uika.correspondence import Fit
 from uika.data import Sample
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
-from uika.files import replacing
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
+from uika.io.files import replacing
+from uika.io.video import to_bytes
 from uika.reconstruction import (
     MAX_PHOTOS,
     LoadedModel,
@@ -31,7 +32,6 @@ from uika.reconstruction import (
 from uika.rendering import render
 from uika.train.align import aligned_camera
 from uika.train.crops import View
-from uika.video import to_bytes
 
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any
 

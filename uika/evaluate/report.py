@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from uika.evaluate.strips import titles
 from uika.evaluate.tables import HEADINGS, Section, gather, heading, write_sequences
-from uika.files import replacing
+from uika.io.files import replacing
 
 FILES = ("report.md", "report.html", "sequences.csv")
 _PICTURES = 12  # at most, of each section

@@ -30,16 +30,16 @@ from uika.evaluate.store import (
     write_result,
 )
 from uika.evaluate.strips import write_strip
-from uika.files import check_folder
 from uika.head import HeadModel, load_head
+from uika.io.files import check_folder
+from uika.io.progress import counted
+from uika.io.weights import sha256
 from uika.lpips import Lpips
 from uika.metrics.arcface import ArcFace
 from uika.photo import PhotoError
-from uika.progress import counted
 from uika.reconstruction import MAX_PHOTOS, LoadedModel, load_model
 from uika.train.crops import View
 from uika.train.people import find_people
-from uika.weights import sha256
 
 TRUTHS = 4  # sequences whose targets are remembered
 SHOWN = 2  # targets of each result that pictures are kept of

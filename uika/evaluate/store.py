@@ -12,7 +12,7 @@ from typing import Any
 from uika.errors import UikaError
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.score import Scores
-from uika.files import replacing
+from uika.io.files import replacing
 
 RESULTS, PICTURES, PROTOCOL, FRAMES = "results", "pictures", "protocol.json", "frames.json"
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from uika.io.video import write_png
 from uika.metrics import flip_map
-from uika.video import write_png
 
 MOST = 256  # pixels of a cell
 _RAMP = (  # error from 0 to 1, readable in grey and by the colour-blind

@@ -10,7 +10,7 @@ from pathlib import Path
 from uika.evaluate.protocol import METRICS, Metric, Protocol
 from uika.evaluate.score import mean
 from uika.evaluate.store import PROTOCOL, RESULTS, Result, read_protocol, read_result
-from uika.files import replacing
+from uika.io.files import replacing
 
 ABSENT = "-"
 

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from uika.files import check_output, replacing
 from uika.head.actions import ARKIT_ACTIONS
+from uika.io.files import check_output, replacing
 from uika.motion import Motion, MotionError
 
 FPS = 60.0  # of phones, where the file does not say

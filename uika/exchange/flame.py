@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npz
-from uika.files import check_output, replacing
+from uika.io.files import check_output, replacing
+from uika.io.npz import ArraysError, read_npz
 from uika.motion import Motion, MotionError
 
 FPS = 25.0  # the files do not say

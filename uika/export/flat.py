@@ -9,7 +9,7 @@ import torch
 
 from uika.errors import UikaError
 from uika.export.splats import Splats
-from uika.files import check_output, replacing
+from uika.io.files import check_output, replacing
 
 _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from uika._version import __version__
 from uika.errors import UikaError
 from uika.export.splats import Splats
-from uika.files import check_output, replacing
+from uika.io.files import check_output, replacing
 
 EXTENSION = "KHR_gaussian_splatting"
 _C0 = 0.28209479177387814  # the constant spherical harmonic

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.errors import UikaError
-from uika.files import check_output, replacing
 from uika.head import HeadModel, pose_gaussians, pose_vertices
+from uika.io.files import check_output, replacing
 from uika.motion import Motion
 from uika.rendering import neutral_camera
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.export.splats import Splats, posed_splats
-from uika.files import check_folder, check_output, replacing
 from uika.head import HeadModel
+from uika.io.files import check_folder, check_output, replacing
+from uika.io.progress import counted
 from uika.motion import Motion
-from uika.progress import counted
 
 _FLAME_SHAPES, _FLAME_EXPRESSIONS = 300, 100
 

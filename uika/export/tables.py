@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from uika.avatar import Avatar
-from uika.files import check_output, replacing
 from uika.head import HeadModel, pose_vertices
+from uika.io.files import check_output, replacing
 from uika.motion import Motion
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npy, read_npz
 from uika.head.model import JOINT_PARENTS, HeadError, HeadModel
 from uika.head.unpickle import UnpickleError, read_arrays
+from uika.io.npz import ArraysError, read_npy, read_npz
 
 VERTICES = 5023
 IDENTITIES, EXPRESSIONS = 300, 100

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npz
+from uika.io.npz import ArraysError, read_npz
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 JOINT_PARENTS = (-1, 0, 1, 1, 1)

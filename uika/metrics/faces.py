@@ -23,8 +23,8 @@ class FaceFit(NamedTuple):
 
 def find_landmarks(image: Tensor) -> Tensor | None:
     """Face mesh landmarks [478,2] in pixels of the largest face in a picture [H,W,3] in [0,1]; None without a face."""
+    from uika.io.video import to_bytes
     from uika.photo.detect import find_face
-    from uika.video import to_bytes
 
     found = find_face(np.ascontiguousarray(to_bytes(image)))
     return None if found is None else torch.from_numpy(found)

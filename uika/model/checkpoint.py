@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from uika.files import write_tensors
+from uika.io.files import write_tensors
 from uika.model.config import PRESETS, ModelConfig
 from uika.model.reconstructor import Reconstructor
 

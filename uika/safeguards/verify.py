@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.arrays import ArraysError, read_npz
 from uika.errors import UikaError
+from uika.io.npz import ArraysError, read_npz
+from uika.io.video import open_video
 from uika.safeguards.provenance import as_text
 from uika.safeguards.watermark import Detection, detect
-from uika.video import open_video
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm")

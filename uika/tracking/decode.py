@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.errors import UikaError
-from uika.video import open_video
+from uika.io.video import open_video
 
 AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say

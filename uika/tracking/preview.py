@@ -13,10 +13,10 @@ from torch import Tensor
 from uika.convert.embed import paint, shade
 from uika.correspondence.frames import Pose
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project
-from uika.progress import counted
+from uika.io.progress import counted
+from uika.io.video import write_video
 from uika.tracking.decode import video_frames
 from uika.tracking.track import Track
-from uika.video import write_video
 
 HEIGHT = 384  # pixels
 DOT = (0.1, 1.0, 0.2)

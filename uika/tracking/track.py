@@ -18,8 +18,8 @@ from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model,
 from uika.correspondence.landmarks import LandmarkFit, eye_distance, fit_landmarks
 from uika.correspondence.turns import Array
 from uika.head import HeadModel, load_head
+from uika.io.progress import counted
 from uika.motion import Motion
-from uika.progress import counted
 from uika.retime import smoothed
 from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_person
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from uika._version import __version__
-from uika.files import write_tensors
+from uika.io.files import write_tensors
 from uika.model import CheckpointError, Estimator, EstimatorConfig, Reconstructor, load_checkpoint, save_checkpoint
 from uika.model.checkpoint import check_depth
 from uika.model.config import BackboneConfig, ModelConfig

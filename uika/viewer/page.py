@@ -14,10 +14,10 @@ import torch
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, HeadParameters
+from uika.io.video import to_bytes
 from uika.motion import Motion
 from uika.rendering import neutral_camera
 from uika.safeguards import mark
-from uika.video import to_bytes
 from uika.viewer.camera import CameraFace
 from uika.viewer.live import UNITS, LiveSplats
 from uika.viewer.painting import Painting

@@ -39,9 +39,9 @@ def exported(
 def _picture(
     path: Path, avatar: Avatar, head: HeadModel, params: HeadParameters, camera: Camera, watermark: bool
 ) -> None:
+    from uika.io.video import write_png
     from uika.rendering import render
     from uika.safeguards import mark, picture_provenance
-    from uika.video import write_png
 
     rgb = render(avatar, params, camera, head).rgb
     write_png(path, mark(rgb) if watermark else rgb, picture_provenance(avatar, watermark=watermark))

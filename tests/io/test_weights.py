@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from uika import weights
 from uika.cli import main
+from uika.io import weights
 
 
 def test_nothing_there(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.errors import UikaError
-from uika.files import check_output, replacing
+from uika.io.files import check_output, replacing
 
 _QUALITY = "18"  # x264's constant rate factor; visually lossless for most eyes
 _AHEAD = 4  # pictures that may wait for the encoder
