@@ -113,7 +113,7 @@ def film(
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
     picture: Picture | None = None
-    for index in counted(len(motion), progress):
+    for index in counted(range(len(motion)), progress, len(motion), "frames"):
         place = index % _BLOCK
         if place == 0:
             vertices, turns = stage.meshes(params[index : index + _BLOCK])

@@ -102,7 +102,7 @@ def frames(
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     canonical = avatar.canonical_vertices(model)
     params = motion.parameters(avatar.identity)
-    for index in counted(len(motion), progress):
+    for index in counted(range(len(motion)), progress, len(motion), "frames"):
         camera = path[index]
         yield render(avatar, params[index], camera, model, background, canonical=canonical)
 

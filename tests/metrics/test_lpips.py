@@ -6,7 +6,7 @@ from safetensors.torch import save_file
 
 from tests.metrics.lpips_files import random_weights, write_weights
 from uika.errors import UikaError
-from uika.lpips import Lpips
+from uika.metrics.lpips import Lpips
 
 
 @pytest.fixture(scope="module")

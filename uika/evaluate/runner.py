@@ -34,8 +34,8 @@ from uika.head import HeadModel, load_head
 from uika.io.files import check_folder
 from uika.io.progress import counted
 from uika.io.weights import sha256
-from uika.lpips import Lpips
 from uika.metrics.arcface import ArcFace
+from uika.metrics.lpips import Lpips
 from uika.photo import PhotoError
 from uika.reconstruction import MAX_PHOTOS, LoadedModel, load_model
 from uika.train.crops import View

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from uika.evaluate.protocol import Protocol
 from uika.head import HeadModel
-from uika.losses import SSIM_REACH
-from uika.lpips import Lpips
 from uika.metrics import expression_distance, fit_faces, flip_map, keypoint_distance, pose_distance, psnr
 from uika.metrics.arcface import ArcFace, identity_similarity
 from uika.metrics.faces import find_landmarks
 from uika.metrics.image import ssim_pixels
+from uika.metrics.lpips import Lpips
+from uika.metrics.structural_similarity import SSIM_REACH
 
 Scores = dict[str, list[float | None]]  # metric -> its value for each frame, None where it has none
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from uika.errors import UikaError, install_command
 
@@ -22,17 +22,5 @@ def counted(items: Iterable[Item], progress: bool, total: int | None, name: str)
         from tqdm import tqdm
     except ModuleNotFoundError as error:
         raise UikaError(f"the progress bar needs tqdm; run: {install_command('tqdm')}") from error
-    bar: Iterable[Item] = tqdm(items, total=total, desc=name, unit="frame", leave=False)
-    return bar
-
-
-def counted(count: int, progress: bool) -> Iterable[int]:
-    """The numbers of the frames, with a progress bar on stderr if asked for."""
-    if not progress:
-        return range(count)
-    try:
-        from tqdm import tqdm
-    except ModuleNotFoundError as error:
-        raise UikaError(f"the progress bar needs tqdm; run: {install_command('tqdm')}") from error
-    bar: Any = tqdm(range(count), desc="frames", unit="frame", leave=False, disable=None)
+    bar: Iterable[Item] = tqdm(items, total=total, desc=name, unit="frame", leave=False, disable=None)
     return bar

@@ -1,7 +1,7 @@
 """Image and face metrics; what each means is in docs/evaluation.md."""
 
 from uika.metrics.faces import expression_distance, fit_faces, keypoint_distance, pose_distance
-from uika.metrics.flip import flip, flip_map
+from uika.metrics.flip_error import flip, flip_map
 from uika.metrics.image import mask_iou, psnr, ssim
 
 __all__ = [

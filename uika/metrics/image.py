@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import correlate1d
 from torch import Tensor
 
-from uika.losses import SSIM_REACH, SSIM_WINDOW, ssim_map
+from uika.metrics.structural_similarity import SSIM_REACH, SSIM_WINDOW, ssim_map
 
 
 def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
-from uika.lpips import Lpips
+from uika.metrics.lpips import Lpips
 from uika.model import computes_bfloat16
 from uika.train.checkpoint import Checkpoints, Progress, read_progress
 from uika.train.config import TrainConfig
