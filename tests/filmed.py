@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 
 from uika.acting import expression_vector
-from uika.convert.embed import paint, shade
 from uika.head import HeadModel, HeadParameters, look_at, pose_vertices
+from uika.head.face_paint import paint, shade
 from uika.io.video import write_video
 
 GAP = range(10, 14)

@@ -19,6 +19,7 @@ from uika.head import (
     uv_texels,
     vertex_normals,
 )
+from uika.head.rotations import matrices_to_quaternions
 from uika.model import SurfaceTexels
 
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
@@ -54,7 +55,7 @@ def surface_texels(
     frames, sides = _texel_frames(head, vertices, binding, points)
     sides = torch.where(_at_seam(binding)[:, None], SEAM * sides, sides)
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
-    quats = _quaternions(frames)
+    quats = matrices_to_quaternions(frames)
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     deviation = (vertices - head.template)[head.faces[binding.triangle]] * binding.barycentric[..., None]
     shape = binding.to_map(deviation.sum(1))
@@ -169,21 +170,3 @@ def _step(place: Tensor, binding: Binding, axis: int, slope: Tensor) -> Tensor:
 
 def _unit(vectors: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-20)
-
-
-def _quaternions(rotation: Tensor) -> Tensor:
-    """Unit quaternions [...,4] (wxyz) of rotation matrices [...,3,3]."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
-    rows = torch.stack(
-        (
-            torch.stack((1 + xx + yy + zz, zy - yz, xz - zx, yx - xy), -1),
-            torch.stack((zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx), -1),
-            torch.stack((xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy), -1),
-            torch.stack((yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz), -1),
-        ),
-        -2,
-    )
-    # Every row is the quaternion times four times one of its entries; the row of the largest entry is the exactest.
-    best = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    chosen = rows.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
-    return torch.nn.functional.normalize(chosen, dim=-1)

@@ -16,9 +16,9 @@ from uika.correspondence.frames import (
     head_landmarks,
     landmark_jacobian,
 )
-from uika.correspondence.turns import Array, axis_angle, rotation
 from uika.head import HeadModel, HeadParameters, pose_vertices
 from uika.head.actions import fitted_joints
+from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.motion import Motion, MotionError
 
 NOISE = 5e-4  # metres; weighs the landmarks against the prior of 1 on each squared coefficient

@@ -10,10 +10,11 @@ import torch
 from tests.flame_files import flame_arrays, write_obj, write_pickle
 from uika.cli import main
 from uika.convert import adopt
-from uika.convert.embed import mouth_slit, nearest
+from uika.convert.embed import nearest
 from uika.correspondence import fit_landmarks
 from uika.head import HeadModel, load_head, look_at, project
 from uika.head.actions import fitted_joints
+from uika.head.face_paint import mouth_slit
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from uika.correspondence.frames import (
     moved,
 )
 from uika.correspondence.landmarks import eye_distance
-from uika.correspondence.turns import Array, axis_angle, rotation
 from uika.head import HeadModel, load_head
+from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.head.flame import read_flame
 
 FOCAL = 1200.0

@@ -7,9 +7,9 @@ import torch
 
 from tests.train.common import CONFIG, SIZE, PaintedPeople, PaintedPerson
 from uika.head import load_head, look_at, pose_vertices, project
+from uika.head.alignment import aligned_camera
 from uika.head.parameters import HeadParameters
 from uika.train import Draw, ItemMaker
-from uika.train.align import aligned_camera
 from uika.train.augment import degrade, draw_grade
 from uika.train.crops import View
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from uika.convert.embed import embed, eyeballs, paint
+from uika.convert.embed import embed
 from uika.convert.regions import region_masks
 from uika.head import HeadError, HeadModel, save_head
+from uika.head.face_paint import eyeballs, paint
 from uika.head.flame import read_flame
 from uika.head.unpickle import UnpickleError, read_arrays
 from uika.io.files import check_output, replacing

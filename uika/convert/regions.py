@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from uika.convert.embed import SIZE, eyeballs, mouth_slit
 from uika.head import HeadModel, look_at, project, rasterize, vertex_normals
+from uika.head.face_paint import SIZE, eyeballs, mouth_slit
 
 # Outlines in the 478-point face mesh.
 FACE_OVAL = (

@@ -17,8 +17,8 @@ from uika.correspondence.frames import (
     head_landmarks,
     landmark_jacobian,
 )
-from uika.correspondence.turns import Array, cross
 from uika.head import HeadModel
+from uika.head.axis_angle import Array, cross
 
 NEIGHBOURS = 4
 GROUP = 100.0  # landmarks that err as one when neighbours err alike

@@ -23,8 +23,8 @@ from uika.correspondence.frames import (
     moved,
     surface_model,
 )
-from uika.correspondence.turns import Array
 from uika.head import HeadModel, look_at, project, rasterize, uv_texels
+from uika.head.axis_angle import Array
 
 SIDE = 224  # pixels of the face crop that is compared
 FRONT_SIZE = 640  # pixels, of the pictures that tell which points are visible

@@ -29,8 +29,8 @@ from uika.correspondence.appearance import (
     sample,
 )
 from uika.correspondence.frames import FrameModel, Pose, moved, shifted
-from uika.correspondence.turns import Array
 from uika.head import HeadModel
+from uika.head.axis_angle import Array
 
 MODES = 60  # of the identity; finer ones do not show at video resolution
 IDENTITY_PULL = 3.0  # per squared standard deviation away from the landmarks' identity

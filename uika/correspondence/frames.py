@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from uika.correspondence.landmarks import CONTOUR_WEIGHT, EYELIDS, LIPS, UNFITTED, LandmarkFit
-from uika.correspondence.turns import Array, axis_angle, cross, rotation
 from uika.head import HeadModel, vertex_normals
 from uika.head.actions import fitted_joints, has_actions
+from uika.head.axis_angle import Array, axis_angle, cross, rotation
 
 NOISE = 0.02  # expected landmark error, in the face's pixel unit (outer eye-corner distance)
 ROBUST_SCALE = 0.08  # errors beyond this lose influence (Geman-McClure)

@@ -14,8 +14,8 @@ from uika.correspondence.appearance import View, face_view, follow, learn, make_
 from uika.correspondence.bundle import bundle
 from uika.correspondence.frames import Pose, frame_model, landmark_pull
 from uika.correspondence.landmarks import LandmarkFit, eye_distance
-from uika.correspondence.turns import Array
 from uika.head import HeadModel
+from uika.head.axis_angle import Array
 
 BLUR = 0.8  # pixels of the face crop
 FOLLOW_STEPS = 6

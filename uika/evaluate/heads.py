@@ -18,6 +18,7 @@ from uika.data import Sample
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
+from uika.head.alignment import aligned_camera
 from uika.io.files import replacing
 from uika.io.video import to_bytes
 from uika.reconstruction import (
@@ -30,7 +31,6 @@ from uika.reconstruction import (
     prepare_file,
 )
 from uika.rendering import render
-from uika.train.align import aligned_camera
 from uika.train.crops import View
 
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any

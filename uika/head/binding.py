@@ -10,6 +10,7 @@ from uika.head.atlas import Binding
 from uika.head.model import HeadModel
 from uika.head.parameters import HeadParameters
 from uika.head.posing import joint_transforms
+from uika.head.rotations import quaternion_components
 
 SMALL = 1e-18
 FLAT = 1e-6  # twice the area over the longest edge squared, below which a triangle counts as flat
@@ -137,7 +138,7 @@ def _vertex_motion(canonical: Tensor, posed: Tensor, faces: Tensor) -> Tensor:
     turned_tangent = cosine * posed_tangent + sine * posed_bitangent
     turned_bitangent = cosine * posed_bitangent - sine * posed_tangent
     pairs = ((turned_tangent, tangent), (turned_bitangent, bitangent), (posed_normal, normal))
-    quats = _matrix_to_quaternion(sum(after[:, None] * before[None] for after, before in pairs)) * area  # type: ignore[arg-type]
+    quats = _unit(quaternion_components(sum(after[:, None] * before[None] for after, before in pairs))) * area  # type: ignore[arg-type]
     # A quaternion and its negative are one rotation; before sums, all lie on the side of the whole mesh's rotation.
     with torch.no_grad():
         towards = rigid_turn(canonical, posed)
@@ -195,26 +196,6 @@ def _in_plane_twist(
     across = torch.where(sound, -shear, 0.0)
     scale = (along.square() + across.square() + SMALL).rsqrt()
     return along * scale, across * scale
-
-
-def _matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """Unit quaternions [4,...] (wxyz, any sign) of rotations [3,3,...]."""
-    xx, yy, zz = matrix[0, 0], matrix[1, 1], matrix[2, 2]
-    x, y, z = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
-    xy, xz, yz = matrix[0, 1] + matrix[1, 0], matrix[0, 2] + matrix[2, 0], matrix[1, 2] + matrix[2, 1]
-    squares = torch.stack((1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz))
-    rows = (
-        torch.stack((squares[0], x, y, z)),
-        torch.stack((x, squares[1], xy, xz)),
-        torch.stack((y, xy, squares[2], yz)),
-        torch.stack((z, xz, yz, squares[3])),
-    )
-    # Each row is the quaternion times four times one of its entries; the largest entry gives the exactest row.
-    best = squares.argmax(0)
-    chosen = rows[3]
-    for index in range(3):
-        chosen = torch.where(best == index, rows[index], chosen)
-    return _unit(chosen)
 
 
 def _components_first(points: Tensor) -> Tensor:

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from uika.head.model import JOINT_PARENTS, HeadModel
 from uika.head.parameters import HeadParameters
-
-
-def rodrigues(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices [...,3,3] of axis-angle vectors [...,3] in radians; smooth at zero."""
-    # The floor keeps the square root's gradient finite at zero; sinc keeps both factors exact there.
-    angle = (axis_angle.square().sum(-1) + 1e-30).sqrt()[..., None, None]
-    first = torch.sinc(angle / math.pi)
-    second = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
-    x, y, z = axis_angle.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
-    return identity + first * cross + second * (cross @ cross)
+from uika.head.rotations import rodrigues
 
 
 def shaped_vertices(head: HeadModel, params: HeadParameters, static_offset: Tensor | None = None) -> Tensor:

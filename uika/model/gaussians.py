@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 
@@ -74,18 +73,3 @@ class CanonicalGaussians:
 
 
 _FIELDS = tuple(name for name in CanonicalGaussians.__annotations__ if name != "report")
-
-
-def multiply_quaternions(first: Tensor, second: Tensor) -> Tensor:
-    """Hamilton product of wxyz quaternions [...,4]: rotate by `second`, then by `first`."""
-    w1, x1, y1, z1 = first.unbind(-1)
-    w2, x2, y2, z2 = second.unbind(-1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=-1,
-    )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from uika.correspondence.appearance import Appearance, View, face_view, follow, learn
 from uika.correspondence.frames import FrameModel, Pose, landmark_pull
-from uika.correspondence.turns import Array
+from uika.head.axis_angle import Array
 
 BLURS = ((2.5, 3), (0.8, 3))  # pixels of the face crop, and steps at that blur
 LANDMARK_PULL = 0.01  # landmarks only keep the colours from getting lost: their errors are systematic

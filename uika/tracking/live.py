@@ -10,8 +10,8 @@ from torch import Tensor
 
 from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
 from uika.correspondence.landmarks import eye_distance, fit_landmarks
-from uika.correspondence.turns import Array
 from uika.head import HeadModel, HeadParameters
+from uika.head.axis_angle import Array
 from uika.retime import MIN_CUTOFF, SPEED_GAIN
 from uika.tracking.poses import poses_to_motion
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from uika.correspondence.frames import FrameModel, Pose
-from uika.correspondence.turns import Array, axis_angle, rotation
 from uika.head import HeadModel
+from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.motion import Motion
 
 

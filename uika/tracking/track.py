@@ -16,8 +16,8 @@ from uika.correspondence.appearance import View, face_view, learn, make_appearan
 from uika.correspondence.bundle import bundle
 from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
 from uika.correspondence.landmarks import LandmarkFit, eye_distance, fit_landmarks
-from uika.correspondence.turns import Array
 from uika.head import HeadModel, load_head
+from uika.head.axis_angle import Array
 from uika.io.progress import counted
 from uika.motion import Motion
 from uika.retime import smoothed
