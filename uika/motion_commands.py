@@ -36,7 +36,7 @@ class ImportHead:
     def run(self) -> int:
         """Read, embed landmarks, save."""
         target = check_output(self.output, ".npz")
-        from uika.convert import import_flame
+        from uika.head_import import import_flame
 
         head = import_flame(self.model, target, self.obj, self.masks, self.eyelids)
         print(f"wrote {target}: {_summary(head)}")

@@ -21,7 +21,7 @@ from uika.correspondence.frames import (
 from uika.correspondence.landmarks import eye_distance
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array, axis_angle, rotation
-from uika.head.flame import read_flame
+from uika.head_import.flame_file import read_flame
 
 FOCAL = 1200.0
 FRONT = np.diag([1.0, -1.0, -1.0])
@@ -73,7 +73,7 @@ def test_jaw_and_eyes_turn_where_no_action_stands_for_them(tmp_path, head: HeadM
     np.savez(tmp_path / "model.npz", **flame_arrays())
     flame = read_flame(tmp_path / "model.npz")
     marks = {"landmark_ids": head.landmark_ids, "landmark_weights": head.landmark_weights}
-    from uika.convert.embed import nearest
+    from uika.head_import.landmark_embedding import nearest
 
     triangle, mix, _ = nearest(head.landmarks(head.template), flame.template, flame.faces)
     flame = replace(flame, landmark_faces=triangle, landmark_barycentrics=mix, **marks)

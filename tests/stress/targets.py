@@ -25,7 +25,7 @@ from uika.data.encode import encode_pixels
 from uika.exchange import read_csv, read_flame_params, read_json, write_csv, write_flame_params, write_json
 from uika.head import HeadError, load_head, save_head
 from uika.head.actions import ARKIT_ACTIONS
-from uika.head.unpickle import UnpickleError, read_arrays
+from uika.head_import.unpickle import UnpickleError, read_arrays
 from uika.motion import Motion, MotionError, load_motion, save_motion
 from uika.photo import PhotoError
 from uika.photo.read import read

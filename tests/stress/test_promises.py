@@ -19,7 +19,7 @@ import pytest
 from uika.avatar import Avatar, AvatarError
 from uika.data import DataError, open_capture, read_shard
 from uika.exchange import read_json
-from uika.head.unpickle import UnpickleError, read_arrays
+from uika.head_import.unpickle import UnpickleError, read_arrays
 from uika.io.npz import ArraysError, read_npz
 from uika.motion import MotionError
 
@@ -28,8 +28,8 @@ from .targets import TARGETS, captures
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT = int(os.environ.get("UIKA_FUZZ", 60))
-# The one unpickler: every name resolves to an inert record, see uika.head.unpickle.
-ALLOWED = {("uika/head/unpickle.py", "pickle.Unpickler")}
+# The one unpickler: every name resolves to an inert record, see uika.head_import.unpickle.
+ALLOWED = {("uika/head_import/unpickle.py", "pickle.Unpickler")}
 LOADERS = {
     *("pickle.load", "pickle.loads", "pickle.Unpickler", "cPickle.load", "dill.load", "dill.loads", "joblib.load"),
     *("marshal.load", "marshal.loads", "shelve.open", "yaml.load", "yaml.unsafe_load", "jsonpickle.decode"),

@@ -11,10 +11,10 @@ from tests.filmed import FPS, GAP, act
 from tests.flame_files import flame_arrays
 from uika.acting import get_motion
 from uika.cli import main
-from uika.convert.embed import nearest
 from uika.exchange import read_motion
 from uika.head import HeadModel, load_head, pose_vertices, rodrigues
-from uika.head.flame import read_flame
+from uika.head_import.flame_file import read_flame
+from uika.head_import.landmark_embedding import nearest
 from uika.io.video import write_video
 from uika.motion import load_motion
 from uika.tracking import VideoError, track_video

@@ -10,8 +10,8 @@ import torch
 
 from tests.flame_files import flame_arrays, write_obj, write_pickle
 from uika.head import HeadError, HeadParameters, load_head, pose_vertices, save_head, uv_texels
-from uika.head.flame import read_flame
-from uika.head.unpickle import UnpickleError, read_arrays
+from uika.head_import.flame_file import read_flame
+from uika.head_import.unpickle import UnpickleError, read_arrays
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ import torch
 
 from tests.flame_files import flame_arrays, write_obj, write_pickle
 from uika.cli import main
-from uika.convert import adopt
-from uika.convert.embed import nearest
 from uika.correspondence import fit_landmarks
 from uika.head import HeadModel, load_head, look_at, project
 from uika.head.actions import fitted_joints
 from uika.head.face_paint import mouth_slit
+from uika.head_import import adopt
+from uika.head_import.landmark_embedding import nearest
 
 
 @pytest.fixture(scope="module")

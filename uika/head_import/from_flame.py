@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from uika.convert.embed import embed
-from uika.convert.regions import region_masks
 from uika.head import HeadError, HeadModel, save_head
 from uika.head.face_paint import eyeballs, paint
-from uika.head.flame import read_flame
-from uika.head.unpickle import UnpickleError, read_arrays
+from uika.head_import.flame_file import read_flame
+from uika.head_import.landmark_embedding import embed
+from uika.head_import.masks import region_masks
+from uika.head_import.unpickle import UnpickleError, read_arrays
 from uika.io.files import check_output, replacing
 
 # Mask of ours -> index lists of the FLAME masks file that make it up.
@@ -54,7 +54,7 @@ def import_flame(
     """Convert a FLAME model file to a head file for `--head` or `UIKA_HEAD`.
 
     Args:
-        path: FLAME model, pickle or `.npz`; see `uika.head.flame.read_flame`.
+        path: FLAME model, pickle or `.npz`; see `uika.head_import.flame_file.read_flame`.
         output: the head file to write, `.npz`.
         obj: Wavefront file with the texture coordinates.
         masks: FLAME's masks file (a pickle of index lists), used instead of the masks found from the geometry.

@@ -1,5 +1,5 @@
 """Make other people's head models usable here: read them, embed landmarks, mark regions, write our head file."""
 
-from uika.convert.adopt import adopt, import_flame
+from uika.head_import.from_flame import adopt, import_flame
 
 __all__ = ["adopt", "import_flame"]

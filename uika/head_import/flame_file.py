@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from uika.head.model import JOINT_PARENTS, HeadError, HeadModel
-from uika.head.unpickle import UnpickleError, read_arrays
+from uika.head_import.unpickle import UnpickleError, read_arrays
 from uika.io.npz import ArraysError, read_npy, read_npz
 
 VERTICES = 5023
@@ -29,7 +29,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def read_flame(path: str | Path, obj: str | Path | None = None, eyelids: Sequence[str | Path] = ()) -> HeadModel:
-    """Read a FLAME model without landmarks and masks, which `uika.convert` adds.
+    """Read a FLAME model without landmarks and masks, which `uika.head_import` adds.
 
     Args:
         path: the model file, the public pickle (read by `read_arrays`, nothing in it is executed) or an `.npz` with
