@@ -21,9 +21,9 @@ from torch import Tensor
 
 from benchmarks.figures import lines
 from benchmarks.harness import markdown, save
-from uika.correspondence import Fit, LandmarkFit, fit_landmarks, pixel_uv
-from uika.correspondence.detector import unbiased
-from uika.correspondence.refine import refine_landmark_fit
+from uika.fitting import Fit, LandmarkFit, fit_landmarks, pixel_uv
+from uika.fitting.landmark_bias import unbiased
+from uika.fitting.refinement import refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
 from uika.io.files import replacing
 

@@ -22,7 +22,7 @@ from benchmarks.harness import RESULTS, machine
 from scenes import compare_splats
 from scenes import render as render_mesh
 from uika.avatar import Avatar
-from uika.correspondence.landmarks import EYE_CORNERS
+from uika.fitting.landmarks import EYE_CORNERS
 from uika.head import (
     Camera,
     HeadModel,

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.correspondence import pixel_uv
-from uika.correspondence.fit import Fit
+from uika.fitting import pixel_uv
+from uika.fitting.fit import Fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head
 from uika.model import SurfaceTexels
 from uika.reconstruction import reconstruct

@@ -27,9 +27,9 @@ from benchmarks.harness import interleaved, markdown, save
 from benchmarks.learned import frames_of
 from benchmarks.model_inputs import PORTRAIT, make_views
 from uika.avatar import Avatar
-from uika.correspondence import Fit, pixel_uv
 from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
+from uika.fitting import Fit, pixel_uv
 from uika.growing import GrowingAvatar
 from uika.head import HeadModel, HeadParameters, load_head
 from uika.io.video import write_png

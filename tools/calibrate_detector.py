@@ -23,9 +23,9 @@ from scenes.people import paint, sample_person, wear_glasses
 from scenes.people.hair import hair_offsets
 from scenes.synthesis.deferred import Shader, as_texture, gather_light, lit_stage
 from scenes.synthesis.lighting import backdrop, sample_lighting
-from uika.correspondence.detector import BIAS_PATH, upright, view_polynomials
-from uika.correspondence.landmarks import MESH_POINTS, eye_distance
 from uika.data.performance import perform
+from uika.fitting.landmark_bias import BIAS_PATH, upright, view_polynomials
+from uika.fitting.landmarks import MESH_POINTS, eye_distance
 from uika.head import (
     Camera,
     HeadModel,

@@ -15,7 +15,7 @@ from uika.head import HeadModel, load_head
 from uika.reconstruction import MAX_PHOTOS, Report, assemble, load_model
 
 if TYPE_CHECKING:
-    from uika.correspondence import Fit
+    from uika.fitting import Fit
     from uika.head import Binding
     from uika.model import Keep, Session
     from uika.photo import Photo
@@ -84,7 +84,7 @@ class GrowingAvatar:
         return self._assembled(self._grow(self._photos, Report() if report is None else report))
 
     def _grow(self, new: Sequence[tuple[Photo, Tensor]], report: Report) -> _Growth:
-        from uika.correspondence import fit_photos
+        from uika.fitting import fit_photos
 
         with report.stage("fit"):
             known = None if self._growth is None else self._growth.fit
@@ -121,8 +121,8 @@ class _Growth:
 
     def add(self, photos: Sequence[Photo], fit: Fit, report: Report) -> None:
         """Encode photos whose fit has this identity."""
-        from uika.correspondence import pixel_uv
         from uika.feeding import levels, plausible
+        from uika.fitting import pixel_uv
 
         images, mattes = (torch.stack([getattr(photo, name) for photo in photos]) for name in ("image", "matte"))
         with report.stage("correspondence"):

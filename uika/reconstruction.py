@@ -18,8 +18,8 @@ from uika.errors import UikaError
 from uika.head import Binding, HeadModel, load_head
 
 if TYPE_CHECKING:
-    from uika.correspondence import Fit
     from uika.feeding import ModelInputs
+    from uika.fitting import Fit
     from uika.model import Keep, Reconstructor
     from uika.photo import Photo
 
@@ -148,7 +148,7 @@ def fit_prepared(
     prepared: Sequence[PreparedPhoto], head: HeadModel, *, refine: bool = True, report: Report | None = None
 ) -> FittedPhotos:
     """Fit the head to prepared photos of one person; they come out in the order of their content hashes."""
-    from uika.correspondence import fit_photos
+    from uika.fitting import fit_photos
 
     report = Report() if report is None else report
     ordered = sorted(prepared, key=lambda each: each.photo.sha256)
@@ -185,8 +185,8 @@ def avatar_from_fit(
         report: gets times and counts.
         keep: as in `reconstruct`.
     """
-    from uika.correspondence import pixel_uv
     from uika.feeding import model_inputs
+    from uika.fitting import pixel_uv
 
     with report.stage("correspondence"):
         uv, valid, weight = pixel_uv(fit, head, mattes)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.frames import (
+from uika.fitting.frame_fit import (
     FrameModel,
     Pose,
     bounded_step,

@@ -9,7 +9,7 @@ import torch
 
 from tests.flame_files import flame_arrays, write_obj, write_pickle
 from uika.cli import main
-from uika.correspondence import fit_landmarks
+from uika.fitting import fit_landmarks
 from uika.head import HeadModel, load_head, look_at, project
 from uika.head.actions import fitted_joints
 from uika.head.face_paint import mouth_slit

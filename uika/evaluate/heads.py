@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.correspondence import Fit
 from uika.data import Sample
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
+from uika.fitting import Fit
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices
 from uika.head.alignment import aligned_camera
 from uika.io.files import replacing

@@ -36,7 +36,7 @@ def fit_faces(landmarks: Tensor, head: HeadModel, size: int) -> FaceFit:
     Raises:
         ValueError: the landmarks have another shape or are not finite.
     """
-    from uika.correspondence.landmarks import fit_landmarks
+    from uika.fitting.landmarks import fit_landmarks
 
     fit = fit_landmarks(landmarks, head, size)
     return FaceFit(fit.expression, fit.rotation)

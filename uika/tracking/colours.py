@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.correspondence.appearance import Appearance, View, face_view, follow, learn
-from uika.correspondence.frames import FrameModel, Pose, landmark_pull
+from uika.fitting.frame_fit import FrameModel, Pose, landmark_pull
+from uika.fitting.photometric import Appearance, View, face_view, follow, learn
 from uika.head.axis_angle import Array
 
 BLURS = ((2.5, 3), (0.8, 3))  # pixels of the face crop, and steps at that blur

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
-from uika.correspondence.landmarks import eye_distance, fit_landmarks
+from uika.fitting.frame_fit import FrameModel, Pose, fit_frame, frame_model, start_pose
+from uika.fitting.landmarks import eye_distance, fit_landmarks
 from uika.head import HeadModel, HeadParameters
 from uika.head.axis_angle import Array
 from uika.retime import MIN_CUTOFF, SPEED_GAIN

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.frames import FrameModel, Pose
+from uika.fitting.frame_fit import FrameModel, Pose
 from uika.head import HeadModel
 from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.motion import Motion

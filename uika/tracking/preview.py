@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from uika.correspondence.frames import Pose
+from uika.fitting.frame_fit import Pose
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project
 from uika.head.face_paint import paint, shade
 from uika.io.progress import counted

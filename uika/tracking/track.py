@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from uika.correspondence.appearance import View, face_view, learn, make_appearance
-from uika.correspondence.bundle import bundle
-from uika.correspondence.frames import FrameModel, Pose, fit_frame, frame_model, start_pose
-from uika.correspondence.landmarks import LandmarkFit, eye_distance, fit_landmarks
+from uika.fitting.bundle_adjustment import bundle
+from uika.fitting.frame_fit import FrameModel, Pose, fit_frame, frame_model, start_pose
+from uika.fitting.landmarks import LandmarkFit, eye_distance, fit_landmarks
+from uika.fitting.photometric import View, face_view, learn, make_appearance
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array
 from uika.io.progress import counted

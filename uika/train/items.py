@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence import Fit, fit_photos, pixel_uv
 from uika.data import DataError
 from uika.feeding import model_inputs
+from uika.fitting import Fit, fit_photos, pixel_uv
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
 from uika.head.alignment import align, aligned_camera
 from uika.surface import surface_texels

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.anchor import landmark_trust
-from uika.correspondence.appearance import View, face_view, follow, learn, make_appearance
-from uika.correspondence.bundle import bundle
-from uika.correspondence.frames import Pose, frame_model, landmark_pull
-from uika.correspondence.landmarks import LandmarkFit, eye_distance
+from uika.fitting.bundle_adjustment import bundle
+from uika.fitting.frame_fit import Pose, frame_model, landmark_pull
+from uika.fitting.landmark_prior import landmark_trust
+from uika.fitting.landmarks import LandmarkFit, eye_distance
+from uika.fitting.photometric import View, face_view, follow, learn, make_appearance
 from uika.head import HeadModel
 from uika.head.axis_angle import Array
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
-from uika.correspondence.fit import Fit
+from uika.fitting.fit import Fit
 from uika.head import HeadModel, pose_vertices, project, rasterize, vertex_normals
 
 SURE_MATTE, FULL_MATTE = 0.7, 0.98  # matte values between which a pixel gains weight: edges carry background light

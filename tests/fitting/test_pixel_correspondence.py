@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from uika.correspondence import Fit, pixel_uv
-from uika.correspondence.hair import MAX_OFFSET, fit_hair
-from uika.correspondence.hanging import curtain
+from uika.fitting import Fit, pixel_uv
+from uika.fitting.hair import MAX_OFFSET, fit_hair
+from uika.fitting.long_hair import curtain
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, project, rasterize
 from uika.head import vertex_normals as normals_of
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from uika.correspondence import fit_landmarks
+from uika.fitting import fit_landmarks
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
 
 SIZE = 512

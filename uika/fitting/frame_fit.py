@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from uika.correspondence.landmarks import CONTOUR_WEIGHT, EYELIDS, LIPS, UNFITTED, LandmarkFit
+from uika.fitting.landmarks import CONTOUR_WEIGHT, EYELIDS, LIPS, UNFITTED, LandmarkFit
 from uika.head import HeadModel, vertex_normals
 from uika.head.actions import fitted_joints, has_actions
 from uika.head.axis_angle import Array, axis_angle, cross, rotation

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from tests.flame_files import flame_arrays
-from uika.correspondence.appearance import SIDE, View, follow, learn, make_appearance, place_points
-from uika.correspondence.bundle import bundle
-from uika.correspondence.frames import (
+from uika.fitting.bundle_adjustment import bundle
+from uika.fitting.frame_fit import (
     FrameModel,
     Pose,
     fit_frame,
@@ -18,7 +17,8 @@ from uika.correspondence.frames import (
     landmark_jacobian,
     moved,
 )
-from uika.correspondence.landmarks import eye_distance
+from uika.fitting.landmarks import eye_distance
+from uika.fitting.photometric import SIDE, View, follow, learn, make_appearance, place_points
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.head_import.flame_file import read_flame

@@ -9,10 +9,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from uika.correspondence.detector import unbiased
-from uika.correspondence.hair import fit_hair
-from uika.correspondence.landmarks import fit_landmarks
-from uika.correspondence.refine import Gain, refine_landmark_fit
+from uika.fitting.hair import fit_hair
+from uika.fitting.landmark_bias import unbiased
+from uika.fitting.landmarks import fit_landmarks
+from uika.fitting.refinement import Gain, refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters
 
 

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.correspondence.anchor import identity_modes, landmark_anchor
-from uika.correspondence.appearance import (
+from uika.fitting.frame_fit import FrameModel, Pose, moved, shifted
+from uika.fitting.landmark_prior import identity_modes, landmark_anchor
+from uika.fitting.photometric import (
     CORRELATED,
     EXPRESSION_PRIOR,
     LIGHT_PRIOR,
@@ -28,7 +29,6 @@ from uika.correspondence.appearance import (
     point_trust,
     sample,
 )
-from uika.correspondence.frames import FrameModel, Pose, moved, shifted
 from uika.head import HeadModel
 from uika.head.axis_angle import Array
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.landmarks import LandmarkFit, eye_distance
+from uika.fitting.landmarks import LandmarkFit, eye_distance
 from uika.head import HeadModel
 
 BIAS_PATH = Path(__file__).resolve().parent.parent / "assets" / "detector_bias.npz"

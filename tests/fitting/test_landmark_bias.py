@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from uika.correspondence import fit_landmarks, fit_photos
-from uika.correspondence.detector import detector_bias, unbiased, upright, view_polynomials
-from uika.correspondence.landmarks import LandmarkFit, eye_distance
+from uika.fitting import fit_landmarks, fit_photos
+from uika.fitting.landmark_bias import detector_bias, unbiased, upright, view_polynomials
+from uika.fitting.landmarks import LandmarkFit, eye_distance
 from uika.head import Camera, HeadModel, load_head, look_at, project
 
 SIZE = 512

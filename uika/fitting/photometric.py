@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from uika.correspondence.frames import (
+from uika.fitting.frame_fit import (
     FrameModel,
     Pose,
     bounded_step,

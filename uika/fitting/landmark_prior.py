@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.correspondence.frames import (
+from uika.fitting.frame_fit import (
     FACING,
     HIDDEN_TRUST,
     NOISE,

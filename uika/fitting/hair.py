@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.correspondence.hanging import hanging_hair, overlap
+from uika.fitting.long_hair import hanging_hair, overlap
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project, vertex_normals
 
 MAX_OFFSET, MIN_OFFSET = 0.1, -0.02  # metres; hair pressed flat may lie inside the average skull
@@ -44,7 +44,7 @@ class _Region:
 def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor) -> Tensor:
     """Offset [V,3] in metres that makes the silhouette meet the matte in every photo: at most 0.1 m along the normals.
 
-    Hair that hangs beside the neck is let down first (`uika.correspondence.hanging`).
+    Hair that hangs beside the neck is let down first (`uika.fitting.long_hair`).
 
     Args:
         head: the head model.
