@@ -20,14 +20,14 @@ import torch
 from benchmarks.harness import RESULTS, interleaved, machine, markdown, save
 from drjit_splat.profiling import profile
 from uika.acting import get_motion
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
-from uika.commands import PORTRAIT
-from uika.filming import Stage, film
+from uika.avatar.frame_renderer import FrameRenderer, film
+from uika.avatar.rendering import frames, motion_cameras
 from uika.head import HeadModel, load_head
 from uika.io.video import to_bytes
 from uika.motion import Motion
 from uika.reconstruction import reconstruct
-from uika.rendering import frames, motion_cameras
 
 SIZES = (256, 512, 1024)
 THINNING = (1, 2, 4, 8)
@@ -66,25 +66,25 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
     """Least milliseconds of each stage, each waited for before the next begins."""
     import drjit as dr
 
-    stage = Stage(avatar, head)
+    renderer = FrameRenderer(avatar, head)
     cameras = motion_cameras(avatar, motion, size)
     params = motion.parameters(avatar.identity)
     found: dict[str, list[float]] = {}
     picture = None
     for first in range(0, count, 16):
         start = time.perf_counter()
-        vertices, turns = stage.meshes(params[first : first + 16])
+        vertices, turns = renderer.meshes(params[first : first + 16])
         found.setdefault("meshes", []).append(1e3 * (time.perf_counter() - start) / len(vertices))
         for mesh, turn, camera in zip(vertices, turns, cameras[first : first + 16].viewmat, strict=True):
             view = replace(cameras[first], viewmat=camera)
             dr.sync_thread()
             start = time.perf_counter()
-            stage.rig.pose(mesh, turn)
+            renderer.rig.pose(mesh, turn)
             dr.sync_thread()
             found.setdefault("pose", []).append(1e3 * (time.perf_counter() - start))
             with profile() as report:
                 start = time.perf_counter()
-                picture = stage.develop(stage.expose(mesh, turn, view), picture)
+                picture = renderer.develop(renderer.expose(mesh, turn, view), picture)
                 dr.sync_thread()
                 found.setdefault("frame", []).append(1e3 * (time.perf_counter() - start))
             for name, spent in report.stages.items():

@@ -9,12 +9,12 @@ import torch
 from PIL import Image
 
 from benchmarks.harness import RESULTS
-from uika.commands import PORTRAIT
+from uika.assets import PORTRAIT
+from uika.avatar.rendering import neutral_camera, render
 from uika.head import HeadParameters, load_head
 from uika.io.files import replacing
 from uika.io.video import to_bytes
 from uika.reconstruction import reconstruct
-from uika.rendering import neutral_camera, render
 
 YAWS = (0, 30, -30, 60, -60, 110, 180)
 SIZE = 288

@@ -21,7 +21,9 @@ from torch import Tensor
 from benchmarks.harness import RESULTS, machine
 from scenes import compare_splats
 from scenes import render as render_mesh
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
+from uika.avatar.rendering import render
 from uika.fitting.landmarks import EYE_CORNERS
 from uika.head import (
     Camera,
@@ -37,9 +39,7 @@ from uika.head import (
 from uika.metrics import mask_iou, psnr
 from uika.photo import head_matte
 from uika.reconstruction import Reconstruction, reconstruct
-from uika.rendering import render
 
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 VIEWS = (0.0, 35.0, -35.0, 15.0)  # yaw of the synthetic photos, degrees
 MAP_SIZE = 384  # side of the atlas the built-in model decodes
 

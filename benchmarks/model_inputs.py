@@ -9,16 +9,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
+from uika.avatar.rendering import neutral_camera, render
 from uika.fitting import pixel_uv
 from uika.fitting.fit import Fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head
 from uika.model import SurfaceTexels
 from uika.reconstruction import reconstruct
-from uika.rendering import neutral_camera, render
 from uika.surface import surface_texels
 
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 _YAW, _PITCH = 55.0, 12.0  # degrees to either side
 
 

@@ -27,6 +27,7 @@ from torch import nn
 from benchmarks.figures import lines
 from benchmarks.harness import save
 from benchmarks.model_inputs import Views, make_views
+from uika.avatar.rendering import render
 from uika.head import HeadParameters
 from uika.io.files import write_tensors
 from uika.metrics import psnr
@@ -40,7 +41,6 @@ from uika.model import (
     computes_bfloat16,
     load_checkpoint,
 )
-from uika.rendering import render
 
 CONFIGURATIONS = ("fp32 dense", "fp32 foreground", "bf16 dense", "bf16 foreground", "cached increment")
 

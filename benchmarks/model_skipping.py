@@ -25,8 +25,10 @@ from torch import Tensor
 from benchmarks.figures import bars
 from benchmarks.harness import interleaved, markdown, save
 from benchmarks.learned import frames_of
-from benchmarks.model_inputs import PORTRAIT, make_views
+from benchmarks.model_inputs import make_views
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
+from uika.avatar.rendering import render
 from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
 from uika.fitting import Fit, pixel_uv
@@ -36,7 +38,6 @@ from uika.io.video import write_png
 from uika.metrics import psnr
 from uika.model import CanonicalGaussians, Keep, Reconstructor, Session
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
-from uika.rendering import render
 from uika.train.crops import View
 from uika.train.people import find_people
 

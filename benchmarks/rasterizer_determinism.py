@@ -21,6 +21,7 @@ from benchmarks.harness import markdown, save
 from benchmarks.splat_scenes import Scene, head_scene
 from drjit_splat import profile, rasterization
 from examples import fit_image_torch
+from uika.assets import PORTRAIT
 
 
 def step(scene: Scene, weight: torch.Tensor, count: int | None = None) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -102,9 +103,9 @@ def example(steps: int) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         try:
-            fit_image_torch.fit(fit_image_torch.PORTRAIT, steps=10, report=0)
+            fit_image_torch.fit(PORTRAIT, steps=10, report=0)
             start = time.perf_counter()
-            errors = fit_image_torch.fit(fit_image_torch.PORTRAIT, steps=steps, report=0)
+            errors = fit_image_torch.fit(PORTRAIT, steps=steps, report=0)
             spent = time.perf_counter() - start
         finally:
             os.chdir(here)

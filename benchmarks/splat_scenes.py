@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from drjit_splat import rasterization
+from uika.assets import PORTRAIT
 
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 NAMES = ("30k", "130k", "500k", "avatar", "heavy")
 QUICK = "3k"  # a scene to try a script with
 

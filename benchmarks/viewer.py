@@ -16,8 +16,8 @@ from pathlib import Path
 from benchmarks.harness import markdown, save
 from tests.chromium import Page, page
 from uika.acting import get_motion
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
-from uika.commands import PORTRAIT
 from uika.export import thinned
 from uika.head import HeadModel, load_head
 from uika.motion import Motion

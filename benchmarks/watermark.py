@@ -22,9 +22,9 @@ from PIL import Image
 
 from benchmarks.figures import bars
 from benchmarks.harness import markdown, save
-from benchmarks.splat_scenes import PORTRAIT
 from uika import Avatar, get_motion, load_head
-from uika.filming import film
+from uika.assets import PORTRAIT
+from uika.avatar.frame_renderer import film
 from uika.metrics import psnr
 from uika.reconstruction import reconstruct
 from uika.safeguards import detect, mark

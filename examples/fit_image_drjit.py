@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from drjit_splat.llvm import require
+from uika.assets import PORTRAIT
 
 require()  # before the first array: finds the LLVM library
 
@@ -17,8 +18,6 @@ from drjit.llvm.ad import TensorXf  # noqa: E402
 from drjit.opt import Adam  # noqa: E402
 
 from drjit_splat.drjit_api import rasterization  # noqa: E402
-
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 
 
 def fit(picture: Path, count: int = 4000, steps: int = 200, size: int = 256, report: int = 25) -> list[float]:

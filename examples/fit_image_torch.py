@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 
 from drjit_splat import rasterization, save_ply
-
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
+from uika.assets import PORTRAIT
 
 
 def fit(picture: Path, count: int = 4000, steps: int = 200, size: int = 256, report: int = 25) -> list[float]:

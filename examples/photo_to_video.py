@@ -9,9 +9,9 @@ import torch
 
 import uika
 from uika.acting import expression_vector
+from uika.assets import PORTRAIT
 from uika.safeguards import mark, picture_provenance
 
-PORTRAIT = Path(__file__).resolve().parent.parent / "uika" / "assets" / "portrait.jpg"
 FPS = 25.0
 
 

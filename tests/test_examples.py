@@ -13,7 +13,8 @@ NOTEBOOK = ROOT / "examples" / "avatar.ipynb"
 
 
 def test_photo_becomes_a_marked_video(tmp_path: Path) -> None:
-    from examples.photo_to_video import PORTRAIT, main
+    from examples.photo_to_video import main
+    from uika.assets import PORTRAIT
 
     path = tmp_path / "nod.mp4"
     assert main(PORTRAIT, path, seconds=0.4, size=256) == 10

@@ -3,14 +3,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.head_quality import PORTRAIT
 from tests.agreement import assert_same_avatar
 from uika import GrowingAvatar, HeadModel, UikaError, load_head, reconstruct
+from uika.assets import PORTRAIT
+from uika.avatar.rendering import neutral_camera, render
 from uika.head import HeadParameters
 from uika.io.video import write_png
 from uika.photo import PhotoError
 from uika.reconstruction import Report
-from uika.rendering import neutral_camera, render
 
 
 @pytest.fixture(scope="module")

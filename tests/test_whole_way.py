@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.head_quality import PORTRAIT, mesh_figures, photograph, photos_figures, portrait_figures
+from benchmarks.head_quality import mesh_figures, photograph, photos_figures, portrait_figures
 from tests.agreement import assert_same_avatar
+from uika.assets import PORTRAIT
 from uika.avatar import Avatar
+from uika.avatar.rendering import render
 from uika.head import HeadModel, HeadParameters, load_head, look_at, uv_texels
 from uika.model import build, save_checkpoint
 from uika.reconstruction import Reconstruction, Report, avatar_from_fit, load_model, reconstruct
-from uika.rendering import render
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,9 @@ from scenes.people import paint, sample_person, wear_glasses
 from scenes.people.hair import hair_offsets
 from scenes.synthesis.deferred import Shader, as_texture, gather_light, lit_stage
 from scenes.synthesis.lighting import backdrop, sample_lighting
+from uika.assets import LANDMARK_BIAS
 from uika.data.performance import perform
-from uika.fitting.landmark_bias import BIAS_PATH, upright, view_polynomials
+from uika.fitting.landmark_bias import upright, view_polynomials
 from uika.fitting.landmarks import MESH_POINTS, eye_distance
 from uika.head import (
     Camera,
@@ -132,7 +133,7 @@ def regress(head: HeadModel, errors: Errors) -> Tensor:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=int, default=84)
-    parser.add_argument("-o", "--output", type=Path, default=BIAS_PATH)
+    parser.add_argument("-o", "--output", type=Path, default=LANDMARK_BIAS)
     arguments = parser.parse_args()
     head = load_head()
     measured = []

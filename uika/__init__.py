@@ -13,13 +13,13 @@ from uika._version import __version__
 if TYPE_CHECKING:
     from uika.acting import get_motion
     from uika.avatar import Avatar, AvatarError
+    from uika.avatar.rendering import Rendering, frames, neutral_camera, render
     from uika.errors import UikaError
     from uika.growing import GrowingAvatar
     from uika.head import Camera, HeadModel, HeadParameters, load_head
     from uika.io.video import write_png, write_video
     from uika.motion import Motion, MotionError, load_motion
     from uika.reconstruction import Reconstruction, reconstruct
-    from uika.rendering import Rendering, frames, neutral_camera, render
 
 _HOMES = {
     "Avatar": "avatar",
@@ -31,15 +31,15 @@ _HOMES = {
     "Motion": "motion",
     "MotionError": "motion",
     "Reconstruction": "reconstruction",
-    "Rendering": "rendering",
+    "Rendering": "avatar.rendering",
     "UikaError": "errors",
-    "frames": "rendering",
+    "frames": "avatar.rendering",
     "get_motion": "acting",
     "load_head": "head",
     "load_motion": "motion",
-    "neutral_camera": "rendering",
+    "neutral_camera": "avatar.rendering",
     "reconstruct": "reconstruction",
-    "render": "rendering",
+    "render": "avatar.rendering",
     "write_png": "io.video",
     "write_video": "io.video",
 }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from uika.assets import PORTRAIT
 from uika.checking_commands import Doctor, Weights
 from uika.errors import UikaError
 from uika.evaluate_command import Evaluate
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from uika.head import HeadModel
     from uika.motion import Motion
     from uika.reconstruction import Report
-
-PORTRAIT = Path(__file__).resolve().parent / "assets" / "portrait.jpg"
 
 
 @dataclass(frozen=True)
@@ -94,10 +93,10 @@ class Animate:
         target = check_output(self.output, ".mp4")
         from uika.acting import get_motion
         from uika.avatar import Avatar
-        from uika.filming import film
+        from uika.avatar.frame_renderer import film
+        from uika.avatar.rendering import check_renderer, check_view
         from uika.head import load_head
         from uika.io.video import check_even, write_video
-        from uika.rendering import check_renderer, check_view
         from uika.safeguards import mark, picture_provenance
 
         check_view(0.0, 0.0, check_even(self.size))
@@ -148,9 +147,9 @@ class Render:
         """Render and save."""
         target = check_output(self.output, ".png")
         from uika.avatar import Avatar
+        from uika.avatar.rendering import check_renderer, check_view, neutral_camera, render
         from uika.head import HeadParameters, load_head
         from uika.io.video import write_png
-        from uika.rendering import check_renderer, check_view, neutral_camera, render
         from uika.safeguards import mark, picture_provenance
 
         check_view(self.yaw, self.pitch, self.size)
@@ -183,11 +182,11 @@ class Demo:
         names = ("avatar.safetensors", "talk.mp4", "sheet.png")
         avatar_file, video, picture = (check_output(folder / name, Path(name).suffix) for name in names)
         from uika.acting import get_motion
-        from uika.filming import film
+        from uika.avatar.frame_renderer import film
+        from uika.avatar.rendering import check_renderer
         from uika.head import load_head
         from uika.io.video import write_png, write_video
         from uika.reconstruction import reconstruct
-        from uika.rendering import check_renderer
         from uika.safeguards import mark, picture_provenance, stamped
         from uika.sheet import reconstruction_sheet
 

@@ -54,8 +54,8 @@ class Evaluate:
         from uika.evaluate.report import markdown_table
 
         if self.external is None:
+            from uika.avatar.rendering import check_renderer
             from uika.reconstruction import check_model
-            from uika.rendering import check_renderer
 
             check_model(self.model)
             check_renderer()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from uika._version import __version__
+from uika.assets import TINY_WEIGHTS
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import Binding, HeadModel, load_head
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from uika.photo import Photo
 
 MAX_PHOTOS = 64
-BUILT_IN = Path(__file__).parent / "assets" / "tiny.safetensors"
 _UNTRAINED_OPACITY = 0.95
 
 
@@ -244,7 +244,7 @@ def load_model(model: str | Path) -> LoadedModel:
 
     check_model(model)
     if str(model) == "tiny":
-        return LoadedModel(load_checkpoint(BUILT_IN), "tiny", True)
+        return LoadedModel(load_checkpoint(TINY_WEIGHTS), "tiny", True)
     if str(model) == "none":
         return LoadedModel(build("tiny").eval(), "none", False)
     network = load_checkpoint(model)

@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from uika.acting import EXPRESSIONS, expression_vector
+from uika.avatar.rendering import neutral_camera, render
 from uika.head import Camera, HeadModel, HeadParameters
 from uika.io.video import to_bytes
 from uika.reconstruction import Reconstruction
-from uika.rendering import neutral_camera, render
 
 _YAWS = (-60.0, -30.0, 30.0, 60.0)  # degrees
 _FACES = ("smile", "surprise", "frown", "kiss")

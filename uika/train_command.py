@@ -81,7 +81,7 @@ class Train:
         if "steps" in given:
             config = replace(config, warmup=min(config.warmup, max(1, config.steps // 10)))
         if self.part == "reconstructor":
-            from uika.rendering import check_renderer
+            from uika.avatar.rendering import check_renderer
 
             check_renderer()
         if SYNTHETIC in self.data and len(self.data) > 1:

@@ -37,9 +37,9 @@ class View:
             raise UikaError(f"port must lie between 1024 and 65535, not {self.port}")
         from uika.acting import get_motion
         from uika.avatar import Avatar
+        from uika.avatar.rendering import check_renderer
         from uika.export import thinned
         from uika.head import load_head
-        from uika.rendering import check_renderer
         from uika.viewer import CameraFace, Viewer
 
         avatar, head = Avatar.load(self.avatar), load_head()

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from uika.assets import PORTRAIT
+
 pytest.importorskip("PIL", reason="skipped: pillow is not installed")
 
 from drjit_splat import load_ply
@@ -14,7 +16,7 @@ from examples import fit_image_drjit, fit_image_torch
 
 def test_fit_with_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    errors = fit_image_torch.fit(fit_image_torch.PORTRAIT, count=600, steps=25, size=64, report=0)
+    errors = fit_image_torch.fit(PORTRAIT, count=600, steps=25, size=64, report=0)
     assert errors[-1] < 0.3 * errors[0]
     assert (tmp_path / "fitted.png").stat().st_size > 1000
     assert len(load_ply(tmp_path / "fitted.ply").means) == 600
@@ -22,6 +24,6 @@ def test_fit_with_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_fit_with_drjit_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    errors = fit_image_drjit.fit(fit_image_drjit.PORTRAIT, count=600, steps=25, size=64, report=0)
+    errors = fit_image_drjit.fit(PORTRAIT, count=600, steps=25, size=64, report=0)
     assert errors[-1] < 0.3 * errors[0]
     assert (tmp_path / "fitted.png").stat().st_size > 1000

@@ -1,17 +1,14 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-import uika
+from uika.assets import PORTRAIT
 from uika.head import HeadParameters, load_head, look_at, pose_vertices, project
 from uika.metrics import expression_distance, fit_faces, keypoint_distance, pose_distance
 from uika.metrics.faces import FaceFit, find_landmarks
 
 SIZE = 256
-PORTRAIT = Path(uika.__file__).parent / "assets" / "portrait.jpg"
 
 
 def face(jaw: float = 0.0, yaw: float = 0.0) -> torch.Tensor:

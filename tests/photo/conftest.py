@@ -4,10 +4,8 @@ from pathlib import Path
 
 import pytest
 
-import uika
+from uika.assets import PORTRAIT
 from uika.photo import Photo, prepare
-
-PORTRAIT = Path(uika.__file__).parent / "assets" / "portrait.jpg"
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from uika.avatar import Avatar
+from uika.avatar.rendering import render
 from uika.data import Sample
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
@@ -30,7 +31,6 @@ from uika.reconstruction import (
     fit_prepared,
     prepare_file,
 )
-from uika.rendering import render
 from uika.train.crops import View
 
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any

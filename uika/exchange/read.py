@@ -7,11 +7,11 @@ from pathlib import Path
 
 from torch import Tensor
 
+from uika.assets import HEAD
 from uika.exchange.arkit import read_csv, read_json
 from uika.exchange.flame import is_flame_params, read_flame_params
 from uika.head import HeadModel, load_head
 from uika.head.actions import ARKIT_ACTIONS, has_actions
-from uika.head.model import BUILTIN_PATH
 from uika.motion import Motion, MotionError, load_motion
 
 KINDS = (".npz", ".csv", ".json")
@@ -48,7 +48,7 @@ def _from_actions(motion: Motion, head: HeadModel) -> Motion:
     if not has_actions(head):
         from uika.transfer import transfer
 
-        builtin = load_head(BUILTIN_PATH)
+        builtin = load_head(HEAD)
         return transfer(_from_actions(motion, builtin), builtin, head)
     columns = motion.expression.new_zeros(len(motion), len(head.expression_names))
     columns[:, [head.expression_names.index(name) for name in ARKIT_ACTIONS]] = motion.expression

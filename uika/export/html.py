@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
+from uika.avatar.rendering import neutral_camera
 from uika.errors import UikaError
 from uika.head import HeadModel, pose_gaussians, pose_vertices
 from uika.io.files import check_output, replacing
 from uika.motion import Motion
-from uika.rendering import neutral_camera
 
 _MAX_MODES = 48
 _POSITION_ERROR, _TURN_ERROR = 5e-5, 2e-3  # metres and radians/2 that the motion's compression may cost

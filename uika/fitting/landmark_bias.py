@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from uika.assets import LANDMARK_BIAS
 from uika.fitting.landmarks import LandmarkFit, eye_distance
 from uika.head import HeadModel
 
-BIAS_PATH = Path(__file__).resolve().parent.parent / "assets" / "detector_bias.npz"
 DEGREE = 3
 
 
@@ -53,5 +52,5 @@ def upright(rotation: Tensor) -> Tensor:
 @lru_cache(maxsize=1)
 def detector_bias() -> Tensor:
     """Coefficients [F,478,2] over `view_polynomials`, in outer eye-corner distances of the upright picture."""
-    with BIAS_PATH.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+    with LANDMARK_BIAS.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         return torch.from_numpy(file["bias"].astype(np.float64))

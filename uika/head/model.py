@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.assets import HEAD
 from uika.io.npz import ArraysError, read_npz
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 JOINT_PARENTS = (-1, 0, 1, 1, 1)
-BUILTIN_PATH = Path(__file__).resolve().parent.parent / "assets" / "head.npz"
 _INT16_MAX = 32767
 _QUANTISED = ("identity_basis", "expression_basis")
 
@@ -117,7 +117,7 @@ def load_head(path: str | Path | None = None) -> HeadModel:
     Raises:
         HeadError: the file is missing, damaged, or its arrays do not fit together.
     """
-    resolved = Path(path if path is not None else os.environ.get("UIKA_HEAD") or BUILTIN_PATH)
+    resolved = Path(path if path is not None else os.environ.get("UIKA_HEAD") or HEAD)
     if not resolved.is_file():
         raise HeadError(f"head file {resolved} does not exist; pass a head .npz or unset UIKA_HEAD")
     stat = resolved.stat()

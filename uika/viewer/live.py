@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.filming import Stage
+from uika.avatar.frame_renderer import FrameRenderer
 from uika.head import Camera, HeadModel, HeadParameters, pose_gaussians, shaped_vertices
 
 if TYPE_CHECKING:
-    from uika.head.rig import Posed
+    from uika.avatar.rig import Posed
 
 UNITS = 100.0  # of the page for a metre: covariances in square metres would be too small for half precision
 Paint = Literal["photo", "UV"]
@@ -46,7 +46,7 @@ class LiveSplats:
             shown = torch.cat((uv, torch.zeros(len(uv), 1)), -1)
         self._shown = shown
         rgba = torch.cat((shown, self.avatar.opacities[:, None]), -1).clamp(0, 1)
-        self._stage = Stage(self.painted(), self._head)
+        self._renderer = FrameRenderer(self.painted(), self._head)
         self._buffer[:, 7:8] = (rgba * 255).round().byte().numpy().view(np.uint32)
 
     def painted(self) -> Avatar:
@@ -62,12 +62,12 @@ class LiveSplats:
         binding = (self._head.faces, first.triangle, first.barycentric)
         means, quats, scales = pose_gaussians(first.means, first.quats, first.scales, old, new, *binding)
         self.avatar = dataclasses.replace(first, identity=identity, means=means, quats=quats, scales=scales)
-        self._stage = Stage(self.painted(), self._head)
+        self._renderer = FrameRenderer(self.painted(), self._head)
 
     def pose(self, params: HeadParameters) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
         """The buffer [N,8] and the mesh [V,3] of one pose, in the page's units."""
-        vertices, turn = self._stage.meshes(_many(params))
-        posed = self._stage.rig.pose(vertices[0], turn[0])
+        vertices, turn = self._renderer.meshes(_many(params))
+        posed = self._renderer.rig.pose(vertices[0], turn[0])
         count = len(self.avatar)
         covariances = _covariances(posed, count).numpy().reshape(count, 6)
         np.multiply(posed.means.numpy().reshape(count, 3), np.float32(UNITS), out=self._buffer[:, :3].view(np.float32))
@@ -76,8 +76,8 @@ class LiveSplats:
 
     def draw(self, params: HeadParameters, camera: Camera) -> NDArray[np.uint8]:
         """The picture [H,W,3] of one pose, by the rasterizer, in the colours that are shown."""
-        vertices, turn = self._stage.meshes(_many(params))
-        return self._stage.develop(self._stage.expose(vertices[0], turn[0], camera)).numpy()
+        vertices, turn = self._renderer.meshes(_many(params))
+        return self._renderer.develop(self._renderer.expose(vertices[0], turn[0], camera)).numpy()
 
 
 def _many(params: HeadParameters) -> HeadParameters:

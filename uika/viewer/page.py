@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from uika.avatar import Avatar
+from uika.avatar.rendering import neutral_camera
 from uika.errors import UikaError
 from uika.head import HeadModel, HeadParameters
 from uika.io.video import to_bytes
 from uika.motion import Motion
-from uika.rendering import neutral_camera
 from uika.safeguards import mark
 from uika.viewer.camera import CameraFace
 from uika.viewer.live import UNITS, LiveSplats

@@ -39,8 +39,8 @@ def exported(
 def _picture(
     path: Path, avatar: Avatar, head: HeadModel, params: HeadParameters, camera: Camera, watermark: bool
 ) -> None:
+    from uika.avatar.rendering import render
     from uika.io.video import write_png
-    from uika.rendering import render
     from uika.safeguards import mark, picture_provenance
 
     rgb = render(avatar, params, camera, head).rgb

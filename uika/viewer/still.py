@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
+from uika.avatar.rendering import render
 from uika.head import Camera, HeadModel, HeadParameters
 from uika.metrics import psnr
-from uika.rendering import render
 from uika.viewer.live import UNITS
 
 _GAIN = 8.0  # of the difference that is shown

@@ -17,8 +17,8 @@ from uika import (
     write_png,
     write_video,
 )
+from uika.avatar.rendering import motion_cameras
 from uika.io.video import to_bytes
-from uika.rendering import motion_cameras
 from uika.sheet import contact_sheet
 
 SIZE = 96

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
+from uika.avatar.rendering import motion_cameras
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices
 from uika.head.binding import rigid_turn
 from uika.head.posing import rest_joints
 from uika.io.progress import counted
 from uika.motion import Motion
-from uika.rendering import motion_cameras
 
 if TYPE_CHECKING:
     from drjit_splat.pictures import Exposure, Picture
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
 
 
-class Stage:
+class FrameRenderer:
     """An avatar ready to be filmed: its Gaussians, their binding and its own head, prepared once."""
 
     def __init__(self, avatar: Avatar, head: HeadModel, background: Sequence[float] = (1.0, 1.0, 1.0)) -> None:
@@ -35,7 +35,7 @@ class Stage:
             AvatarError: the head model is not the avatar's.
             RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
         """
-        from uika.head.rig import Rig
+        from uika.avatar.rig import Rig
 
         self.canonical = avatar.canonical_vertices(head)
         self.rig = Rig.of(
@@ -109,17 +109,17 @@ def film(
         RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
     """
     model = load_head() if head is None else head
-    stage = Stage(avatar, model, background)
+    renderer = FrameRenderer(avatar, model, background)
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
     picture: Picture | None = None
     for index in counted(range(len(motion)), progress, len(motion), "frames"):
         place = index % _BLOCK
         if place == 0:
-            vertices, turns = stage.meshes(params[index : index + _BLOCK])
-        exposure = stage.expose(vertices[place], turns[place], path[index])
+            vertices, turns = renderer.meshes(params[index : index + _BLOCK])
+        exposure = renderer.expose(vertices[place], turns[place], path[index])
         done = None if picture is None else picture.numpy()
-        picture = stage.develop(exposure, picture)
+        picture = renderer.develop(exposure, picture)
         if done is not None:
             yield done
     if picture is not None:

@@ -6,7 +6,7 @@ from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, HeadModel, frames, get_motion, neutral_camera
 from uika.avatar import AvatarError
-from uika.filming import film
+from uika.avatar.frame_renderer import film
 from uika.head import load_head
 from uika.io.video import to_bytes
 from uika.motion import Motion

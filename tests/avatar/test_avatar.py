@@ -7,7 +7,7 @@ from safetensors.torch import load_file, save_file
 from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, AvatarError, HeadModel, HeadParameters, load_head
-from uika.avatar import FORMAT, VERSION
+from uika.avatar.avatar import FORMAT, VERSION
 from uika.complete import suppose
 from uika.head import uv_texels
 from uika.surface import mirror_map, surface_texels

@@ -1,0 +1,9 @@
+"""Files that come with the package: the head, the network's weights, the demo portrait; licences in LICENSES.md."""
+
+from pathlib import Path
+
+_FOLDER = Path(__file__).resolve().parent
+PORTRAIT = _FOLDER / "portrait.jpg"
+HEAD = _FOLDER / "head.npz"
+TINY_WEIGHTS = _FOLDER / "tiny.safetensors"
+LANDMARK_BIAS = _FOLDER / "detector_bias.npz"
