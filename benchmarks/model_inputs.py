@@ -12,12 +12,12 @@ from torch import Tensor
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.rendering import neutral_camera, render
+from uika.canonical.surface import surface_texels
 from uika.fitting import pixel_uv
 from uika.fitting.fit import Fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head
 from uika.model import SurfaceTexels
 from uika.reconstruction import reconstruct
-from uika.surface import surface_texels
 
 _YAW, _PITCH = 55.0, 12.0  # degrees to either side
 

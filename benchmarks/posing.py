@@ -19,9 +19,9 @@ from benchmarks.harness import RESULTS, markdown, save
 from uika.acting import expression_vector
 from uika.avatar import Avatar
 from uika.avatar.rig import Rig
+from uika.canonical.surface import surface_texels
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
 from uika.head.binding import rigid_turn
-from uika.surface import surface_texels
 
 COUNT = 130_000
 ATLAS = 416  # texels; a few more than COUNT of them are covered

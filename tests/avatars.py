@@ -3,7 +3,7 @@
 import torch
 
 from uika import Avatar, HeadModel
-from uika.surface import surface_texels
+from uika.canonical.surface import surface_texels
 
 
 def painted_avatar(head: HeadModel, size: int = 64) -> Avatar:

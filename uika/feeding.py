@@ -8,10 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from uika.complete import MOUTH, regions, suppose
+from uika.canonical.prior import prior_colors
+from uika.canonical.regions import MOUTH, regions
+from uika.canonical.surface import surface_texels
 from uika.head import Binding, HeadModel
 from uika.model import ModelConfig, SurfaceTexels
-from uika.surface import surface_texels
 from uika.uv import Aggregate, aggregate
 
 _MID_FACE = 0.55  # sRGB level of skin in even light, for judging how bright the photos are
@@ -56,16 +57,16 @@ def model_inputs(
     weights = weights * plausible(head, binding, uvs)
     oversample = config.uv.oversample
     pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=oversample)
-    prior = supposed(config, head, binding, static_offset, pooled, levels(images, weight))
+    prior = surface_prior(config, head, binding, static_offset, pooled, levels(images, weight))
     return ModelInputs(views, masks, uvs, weights, binding.texel, replace(surface, prior=prior)), binding
 
 
-def supposed(
+def surface_prior(
     config: ModelConfig, head: HeadModel, binding: Binding, static_offset: Tensor, pooled: Aggregate, levels: Tensor
 ) -> Tensor:
     """Colours [3,S,S] for what no photo shows, from all photos pooled and the `levels` of their pixels."""
     known = (pooled.trust[0, 0] / config.uv.full_trust).clamp(0, 1)
-    return suppose(head, binding, static_offset, pooled.rgb[0], known, _brightness(levels))
+    return prior_colors(head, binding, static_offset, pooled.rgb[0], known, _brightness(levels))
 
 
 def plausible(head: HeadModel, binding: Binding, uv: Tensor) -> Tensor:

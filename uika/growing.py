@@ -107,8 +107,8 @@ class _Growth:
     gaussians: tuple[Tensor, ...]
 
     def __init__(self, network: torch.nn.Module, head: HeadModel, fit: Fit, keep: Keep) -> None:
+        from uika.canonical.surface import surface_texels
         from uika.model import Reconstructor, Session
-        from uika.surface import surface_texels
 
         assert isinstance(network, Reconstructor)
         self.fit = fit
@@ -136,8 +136,8 @@ class _Growth:
         self.gaussians = tuple(result)
 
     def _prior(self, sums: Sums) -> Tensor:
-        from uika.feeding import supposed
+        from uika.feeding import surface_prior
         from uika.uv import pool
 
         shown = torch.cat(self._levels)
-        return supposed(self._config, self._head, self.binding, self.fit.static_offset, pool(sums), shown)
+        return surface_prior(self._config, self._head, self.binding, self.fit.static_offset, pool(sums), shown)

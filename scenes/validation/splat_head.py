@@ -32,7 +32,7 @@ def splat_head(
         The channels [H,W,D] divided by the coverage, the coverage [H,W] and the expected depth [H,W].
     """
     from drjit_splat import rasterization
-    from uika.surface import surface_texels
+    from uika.canonical.surface import surface_texels
 
     surface, binding = surface_texels(head, params.identity.detach(), torch.zeros_like(head.template), TEXELS)
     rest = HeadParameters.zeros(head).replace(identity=params.identity)

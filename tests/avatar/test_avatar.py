@@ -8,9 +8,9 @@ from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, AvatarError, HeadModel, HeadParameters, load_head
 from uika.avatar.avatar import FORMAT, VERSION
-from uika.complete import suppose
+from uika.canonical.prior import suppose
+from uika.canonical.surface import mirror_map, surface_texels
 from uika.head import uv_texels
-from uika.surface import mirror_map, surface_texels
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The reconstruction network: photos and their UV correspondence in, canonical Gaussians out."""
 
+from uika.canonical.surface import SurfaceTexels
 from uika.head.rotations import multiply_quaternions
 from uika.model.checkpoint import CheckpointError, build, load_checkpoint, save_checkpoint
 from uika.model.config import (
@@ -13,7 +14,7 @@ from uika.model.config import (
 )
 from uika.model.estimator import Estimator
 from uika.model.features import FeatureCache, Keep, ViewFeatures
-from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
+from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import Observation
 from uika.model.precision import compile_blocks, computes_bfloat16
 from uika.model.reconstructor import Reconstructor

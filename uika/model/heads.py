@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from uika.canonical.surface import SurfaceTexels
 from uika.head.rotations import multiply_quaternions
 from uika.model.config import ModelConfig
-from uika.model.gaussians import SurfaceTexels
 
 # Keeps exp and its gradient finite whatever the network says; far above any scale that survives the clip.
 _MAX_LOG_SCALE = 15.0

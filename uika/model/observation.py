@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from uika.canonical.surface import SurfaceTexels
 from uika.model.config import UvConfig
-from uika.model.gaussians import SurfaceTexels
 from uika.uv import Sums, fill, pool
 
 

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from uika.canonical.surface import SurfaceTexels
 from uika.model.config import ModelConfig
 from uika.model.decoder import GaussianDecoder
 from uika.model.dpt import resize
 from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
-from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
+from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import Observation, observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer

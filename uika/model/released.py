@@ -16,10 +16,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from uika.canonical.surface import SurfaceTexels
 from uika.model.checkpoint import CheckpointError, listing
 from uika.model.estimator import Estimator
 from uika.model.features import FeatureCache, Keep, content_keys
-from uika.model.gaussians import CanonicalGaussians, SurfaceTexels
+from uika.model.gaussians import CanonicalGaussians
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.reconstructor import Reconstructor
 from uika.model.released_sizes import SizeError, estimator_config, model_config

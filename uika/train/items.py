@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.canonical.surface import surface_texels
 from uika.data import DataError
 from uika.feeding import model_inputs
 from uika.fitting import Fit, fit_photos, pixel_uv
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
 from uika.head.alignment import align, aligned_camera
-from uika.surface import surface_texels
 from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
 from uika.train.crops import View

@@ -9,11 +9,11 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from uika.complete import regions
+from uika.canonical.regions import regions
+from uika.canonical.surface import mirror_map
 from uika.head import HeadModel, pose_gaussians, uv_texels
 from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
-from uika.surface import mirror_map
 from uika.train.config import TrainConfig
 from uika.train.items import Item
 from uika.train.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation

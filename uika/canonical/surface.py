@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from uika.complete import regions
+from uika.canonical.regions import regions
 from uika.head import (
     Binding,
     HeadModel,
@@ -20,7 +20,6 @@ from uika.head import (
     vertex_normals,
 )
 from uika.head.rotations import matrices_to_quaternions
-from uika.model import SurfaceTexels
 
 FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: overlap without blur
 SEAM = 1.4  # enlarges splats at the edge of a chart, whose neighbours beyond the seam are moved apart from them
@@ -28,6 +27,36 @@ FLATNESS = 0.1  # standard deviation along the normal over the mean tangential o
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
 _CURVATURE, _MAX_LIFT = 0.75, 4e-3  # share of the full tangent-plane lift, and its limit in metres
 _MIRROR_TOLERANCE = 3e-3  # metres between a mirrored vertex and the vertex it stands for
+
+
+@dataclass(frozen=True)
+class SurfaceTexels:
+    """The canonical head surface at the M valid texels of the atlas; B is the batch size or 1.
+
+    points  [B,M,3] metres
+    quats   [B,M,4] wxyz rotation of the surface frame, local z along the outward normal
+    scales  [B,M,3] metres: standard deviations that close the surface, two tangent sizes and a thin normal one
+    mirror  [S,S] int64 row-major index of each texel's counterpart on the other half of the face, -1 where there is
+            none; None if unknown
+    regions [S,S] int64 labels of parts whose colours do not mix (skin, eyeballs, teeth), or None
+    lift    [1,S,S] metres by which hair stands off the bald head, 0 elsewhere, or None
+    shape   [3,S,S] metres from the mean bald head to the surface, 0 elsewhere, or None
+    prior   [3,S,S] colours for texels that neither a photo nor its mirror image shows, NaN where there is none, or None
+    """
+
+    points: Tensor
+    quats: Tensor
+    scales: Tensor
+    mirror: Tensor | None = None
+    regions: Tensor | None = None
+    prior: Tensor | None = None
+    lift: Tensor | None = None
+    shape: Tensor | None = None
+
+    def rows(self, first: int, last: int) -> SurfaceTexels:
+        """The texels from `first` to before `last`; the maps stay whole."""
+        points, quats, scales = (value[:, first:last] for value in (self.points, self.quats, self.scales))
+        return replace(self, points=points, quats=quats, scales=scales)
 
 
 def surface_texels(

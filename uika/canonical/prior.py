@@ -9,30 +9,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.canonical.regions import REGIONS, at_texels, mask_at_texels, regions
 from uika.head import Binding, HeadModel
-from uika.strands import strands
 
 # sRGB colours under even light of parts that lids and lips hide: no skin may appear there when they open.
 _HIDDEN = {"eyeballs": (0.75, 0.71, 0.69), "mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
-_REGIONS = ("eyeballs", "mouth_inner", "teeth")  # labelled 1, 2, 3; skin and hair are 0
-MOUTH = 2
 _HAIR_DEPTH = 0.012  # metres that hair stands off the scalp where it surely is hair
 _BARE = 0.1  # hairiness up to which the face counts as bare skin
 _SOURCE = 30.0  # pull of a fully seen vertex towards its own colour, relative to an edge
 _KIND_PULL = 0.1  # pull of every vertex towards the typical colour of its kind, skin or hair
 _DEFAULT = 0.5  # grey level where nothing of a kind was seen
+_SEEN = 0.8  # share of the observation from which a texel lends its strands
+_MIN_TEXELS = 500  # fewer say nothing about hair
+_EDGE = 0.08  # share of the seen hair that lies beyond the plane of reflection
+_RISE = 0.55  # heights below the crown shrink by this much, so that the nape finds hair rather than a face
 
 
-def regions(head: HeadModel, binding: Binding) -> Tensor:
-    """Labels [S,S] of the parts whose colours do not mix: 0 skin and hair, 1 eyeballs, 2 inner mouth, 3 teeth."""
-    labels = torch.zeros(len(binding), 1, dtype=torch.int64)
-    for index, name in enumerate(_REGIONS):
-        if name in head.masks:
-            labels[_share(head, binding, name) > 0.5] = index + 1
-    return binding.to_map(labels)[0]
-
-
-def suppose(
+def prior_colors(
     head: HeadModel, binding: Binding, static_offset: Tensor, color: Tensor, known: Tensor, brightness: float
 ) -> Tensor:
     """Colours for every texel of the head, to be used where nothing was seen.
@@ -55,25 +48,16 @@ def suppose(
     # take colour but give none.
     for name in ("ears", "eyes"):
         if name in head.masks:
-            seen = seen * (1 - _share(head, binding, name))
+            seen = seen * (1 - mask_at_texels(head, binding, name))
     hair = _hairiness(head, static_offset)
     vertices = _continue(head, *_to_vertices(head, binding, observed, seen), hair)
-    result = _mixed(head, binding, vertices)
-    points = _mixed(head, binding, head.template)
-    hairy = _mixed(head, binding, hair[:, None])[:, 0] * (labels == 0)
-    result = (result + strands(points, observed, result, seen, hairy)).clamp(0, 1)
-    for index, name in enumerate(_REGIONS):
+    result = at_texels(head, binding, vertices)
+    points = at_texels(head, binding, head.template)
+    hairy = at_texels(head, binding, hair[:, None])[:, 0] * (labels == 0)
+    result = (result + reflected_hair_detail(points, observed, result, seen, hairy)).clamp(0, 1)
+    for index, name in enumerate(REGIONS):
         result[labels == index + 1] = brightness * torch.tensor(_HIDDEN[name])
     return binding.to_map(result, fill=torch.nan)
-
-
-def _mixed(head: HeadModel, binding: Binding, values: Tensor) -> Tensor:
-    """Vertex values [V,C] at the texels [M,C]."""
-    return (values[head.faces[binding.triangle]] * binding.barycentric[..., None]).sum(1)
-
-
-def _share(head: HeadModel, binding: Binding, name: str) -> Tensor:
-    return _mixed(head, binding, head.masks[name][:, None])[:, 0]
 
 
 def _to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,3 +106,37 @@ def _typical(color: Tensor, seen: Tensor) -> Tensor:
     """Median [3] of the colours that were seen well; grey when there are none."""
     chosen = color[seen > 0.5]
     return chosen.median(0).values if len(chosen) else torch.full((3,), _DEFAULT)
+
+
+def reflected_hair_detail(points: Tensor, color: Tensor, smooth: Tensor, seen: Tensor, hair: Tensor) -> Tensor:
+    """What to add to smooth hair colours so that they look like the hair that was seen.
+
+    Args:
+        points: [M,3] texels on the head, metres, Y up.
+        color: [M,3] observed colours.
+        smooth: [M,3] the smooth continuation of those colours.
+        seen: [M] share of each texel that was observed, in [0,1].
+        hair: [M] how far each texel belongs to hair, in [0,1].
+
+    Returns:
+        Detail [M,3], 0 on skin and where too little hair was seen.
+    """
+    from scipy.spatial import cKDTree
+
+    source = (seen > _SEEN) & (hair > 0.5)
+    detail = torch.zeros_like(smooth)
+    if int(source.sum()) < _MIN_TEXELS:
+        return detail
+    target = ~source & (hair > 0)
+    level = torch.tensor([1.0, 0.0, 1.0])
+    towards = torch.nn.functional.normalize((points[source].mean(0) - points[hair > 0.5].mean(0)) * level, dim=0)
+    plane = torch.quantile(points[source] @ towards, _EDGE)
+    wanted = points[target]
+    along = wanted @ towards
+    wanted = wanted + ((plane + (plane - along).abs()) - along)[:, None] * towards
+    crown = points[source, 1].max()
+    wanted[:, 1] = crown - _RISE * (crown - wanted[:, 1]).clamp_min(0)
+    place = torch.nonzero(source).flatten()
+    nearest = place[torch.from_numpy(cKDTree(points[source].numpy()).query(wanted.numpy(), workers=-1)[1])]
+    detail[target] = hair[target, None] * (color[nearest] - smooth[nearest])
+    return detail

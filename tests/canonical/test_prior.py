@@ -2,7 +2,7 @@
 
 import torch
 
-from uika.strands import strands
+from uika.canonical.prior import reflected_hair_detail
 
 
 def ball(count: int = 6000) -> torch.Tensor:
@@ -16,7 +16,7 @@ def test_far_side_gets_the_seen_texture_and_skin_gets_none() -> None:
     seen = (points[:, 2] > 0).float() * hair
     smooth = torch.full((len(points), 3), 0.4)
     stripes = 0.1 * torch.sign(torch.sin(points[:, :1] * 200))
-    detail = strands(points, smooth + stripes, smooth, seen, hair)
+    detail = reflected_hair_detail(points, smooth + stripes, smooth, seen, hair)
     back = (hair > 0) & (points[:, 2] < -0.02) & (points[:, 1] > 0.06)
     assert (detail[hair == 0] == 0).all()
     assert (detail[seen > 0] == 0).all()
@@ -28,4 +28,4 @@ def test_far_side_gets_the_seen_texture_and_skin_gets_none() -> None:
 def test_little_hair_says_nothing() -> None:
     points = ball(300)
     smooth = torch.full((300, 3), 0.4)
-    assert (strands(points, smooth + 0.1, smooth, torch.ones(300), torch.ones(300)) == 0).all()
+    assert (reflected_hair_detail(points, smooth + 0.1, smooth, torch.ones(300), torch.ones(300)) == 0).all()

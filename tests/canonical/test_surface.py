@@ -1,16 +1,16 @@
 import pytest
 import torch
 
-import uika.surface
+import uika.canonical.surface
 from uika.head import load_head, uv_texels
 
 
 def test_splats_along_the_seams_of_the_atlas_are_larger(monkeypatch: pytest.MonkeyPatch) -> None:
     head, size = load_head(), 96
     none = torch.zeros(len(head.identity_basis)), torch.zeros_like(head.template)
-    larger = uika.surface.surface_texels(head, *none, size)[0].scales[0]
-    monkeypatch.setattr(uika.surface, "SEAM", 1.0)
-    plain = uika.surface.surface_texels(head, *none, size)[0].scales[0]
+    larger = uika.canonical.surface.surface_texels(head, *none, size)[0].scales[0]
+    monkeypatch.setattr(uika.canonical.surface, "SEAM", 1.0)
+    plain = uika.canonical.surface.surface_texels(head, *none, size)[0].scales[0]
     row, column = uv_texels(head, size).texel // size, uv_texels(head, size).texel % size
     taken = set(zip(row.tolist(), column.tolist(), strict=True))
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
