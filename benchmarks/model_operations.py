@@ -21,8 +21,8 @@ from benchmarks.figures import lines
 from benchmarks.harness import interleaved, markdown, save
 from uika.head import load_head, uv_texels
 from uika.model import ESTIMATORS, PRESETS, Estimator, Reconstructor, SurfaceTexels
-from uika.model.features import covered_tokens
 from uika.model.transformer import ContextMemory
+from uika.model.view_features import covered_tokens
 
 STAGES = ("encoders", "transformer", "decoder")
 RUNS = ("fp32 dense", "bf16 dense", "bf16 foreground", "bf16 cached increment")

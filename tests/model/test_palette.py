@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from uika.model import PRESETS, ModelConfig, SurfaceTexels, build
-from uika.model.heads import AttributeHeads, Palette
+from uika.model.attribute_heads import AttributeHeads, Palette
 
 Make = Callable[..., dict[str, Any]]
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from uika.model import FeatureCache, ModelConfig, Reconstructor, Session, build, compile_blocks
-from uika.model.features import covered_tokens, occupied
 from uika.model.precision import computes_bfloat16
+from uika.model.view_features import covered_tokens, occupied
 
 Make = Callable[..., dict[str, Any]]
 Perturb = Callable[[Reconstructor], Reconstructor]

@@ -13,12 +13,12 @@ from uika.model.config import (
     UvConfig,
 )
 from uika.model.estimator import Estimator
-from uika.model.features import FeatureCache, Keep, ViewFeatures
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import Observation
 from uika.model.precision import compile_blocks, computes_bfloat16
 from uika.model.reconstructor import Reconstructor
 from uika.model.session import Session
+from uika.model.view_features import FeatureCache, Keep, ViewFeatures
 
 __all__ = [
     "ESTIMATORS",

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from uika.canonical.surface import SurfaceTexels
+from uika.model.attribute_heads import AttributeHeads, Attributes, Palette, TexelMlp
 from uika.model.config import ModelConfig
 from uika.model.dpt import UvDpt, resize
-from uika.model.heads import AttributeHeads, Attributes, Palette, TexelMlp
 
 _LIFT_UNIT, _SHAPE_UNIT = 10.0, 30.0  # channel values of a metre of hair, of a metre off the mean head
 _COARSE = 52  # what is wider than this part of the atlas is no fine relief

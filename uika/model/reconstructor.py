@@ -11,12 +11,12 @@ from uika.canonical.surface import SurfaceTexels
 from uika.model.config import ModelConfig
 from uika.model.decoder import GaussianDecoder
 from uika.model.dpt import resize
-from uika.model.features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import Observation, observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
+from uika.model.view_features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
 from uika.uv import Sums, accumulate, accumulate_sizes, view_images
 
 

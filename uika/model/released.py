@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from uika.canonical.surface import SurfaceTexels
 from uika.model.checkpoint import CheckpointError, listing
 from uika.model.estimator import Estimator
-from uika.model.features import FeatureCache, Keep, content_keys
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.reconstructor import Reconstructor
 from uika.model.released_sizes import SizeError, estimator_config, model_config
+from uika.model.view_features import FeatureCache, Keep, content_keys
 
 # Keys that belong to a released file and change no result here, with the reason.
 UNUSED = {

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from uika.canonical.surface import SurfaceTexels
-from uika.model.features import Keep, ViewFeatures
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import together
 from uika.model.reconstructor import Reconstructor
 from uika.model.transformer import ContextMemory
+from uika.model.view_features import Keep, ViewFeatures
 from uika.uv import Sums
 
 
