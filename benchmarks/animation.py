@@ -19,7 +19,6 @@ import torch
 
 from benchmarks.harness import RESULTS, interleaved, machine, markdown, save
 from drjit_splat.profiling import profile
-from uika.acting import get_motion
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.frame_renderer import FrameRenderer, film
@@ -27,6 +26,7 @@ from uika.avatar.rendering import frames, motion_cameras
 from uika.head import HeadModel, load_head
 from uika.io.video import to_bytes
 from uika.motion import Motion
+from uika.motion.presets import get_motion
 from uika.reconstruction import reconstruct
 
 SIZES = (256, 512, 1024)

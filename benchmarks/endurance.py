@@ -51,8 +51,8 @@ def steps(count: int, every: int) -> list[dict[str, float]]:
 
 def frames(count: int, every: int) -> list[dict[str, float]]:
     """Animated frames of an avatar at changing picture sizes; a row each `every` frames."""
-    from uika.acting import get_motion
     from uika.avatar.frame_renderer import film
+    from uika.motion.presets import get_motion
 
     head = load_head()
     avatar = painted_avatar(head)

@@ -16,12 +16,12 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.harness import RESULTS, markdown, save
-from uika.acting import expression_vector
 from uika.avatar import Avatar
 from uika.avatar.rig import Rig
 from uika.canonical.surface import surface_texels
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
 from uika.head.binding import rigid_turn
+from uika.motion.presets import expression_vector
 
 COUNT = 130_000
 ATLAS = 416  # texels; a few more than COUNT of them are covered

@@ -23,13 +23,13 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.harness import RESULTS, markdown, save
-from uika.acting import get_motion
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.head import HeadModel, load_head, look_at, rodrigues
 from uika.io.video import write_video
 from uika.motion import Motion
+from uika.motion.presets import get_motion
 from uika.reconstruction import reconstruct
 from uika.tracking import Track, track_video, video_frames
 from uika.tracking.preview import face_parameters, tracked_camera

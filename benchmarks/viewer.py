@@ -15,12 +15,12 @@ from pathlib import Path
 
 from benchmarks.harness import markdown, save
 from tests.chromium import Page, page
-from uika.acting import get_motion
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.export import thinned
 from uika.head import HeadModel, load_head
 from uika.motion import Motion
+from uika.motion.presets import get_motion
 from uika.reconstruction import reconstruct
 from uika.viewer import LiveSplats, Viewer
 from uika.viewer.painting import BROWSER, HERE

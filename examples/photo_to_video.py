@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 import uika
-from uika.acting import expression_vector
 from uika.assets import PORTRAIT
+from uika.motion.presets import expression_vector
 from uika.safeguards import mark, picture_provenance
 
 FPS = 25.0

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import torch
 
-from uika.acting import expression_vector
 from uika.head import HeadModel, HeadParameters, look_at, pose_vertices
 from uika.head.face_paint import paint, shade
 from uika.io.video import write_video
+from uika.motion.presets import expression_vector
 
 GAP = range(10, 14)
 FPS = 25.0

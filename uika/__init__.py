@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from uika._version import __version__
 
 if TYPE_CHECKING:
-    from uika.acting import get_motion
     from uika.avatar import Avatar, AvatarError
     from uika.avatar.rendering import Rendering, frames, neutral_camera, render
     from uika.errors import UikaError
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from uika.head import Camera, HeadModel, HeadParameters, load_head
     from uika.io.video import write_png, write_video
     from uika.motion import Motion, MotionError, load_motion
+    from uika.motion.presets import get_motion
     from uika.reconstruction import Reconstruction, reconstruct
 
 _HOMES = {
@@ -34,7 +34,7 @@ _HOMES = {
     "Rendering": "avatar.rendering",
     "UikaError": "errors",
     "frames": "avatar.rendering",
-    "get_motion": "acting",
+    "get_motion": "motion.presets",
     "load_head": "head",
     "load_motion": "motion",
     "neutral_camera": "avatar.rendering",

@@ -91,12 +91,12 @@ class Animate:
     def run(self) -> int:
         """Render and encode."""
         target = check_output(self.output, ".mp4")
-        from uika.acting import get_motion
         from uika.avatar import Avatar
         from uika.avatar.frame_renderer import film
         from uika.avatar.rendering import check_renderer, check_view
         from uika.head import load_head
         from uika.io.video import check_even, write_video
+        from uika.motion.presets import get_motion
         from uika.safeguards import mark, picture_provenance
 
         check_view(0.0, 0.0, check_even(self.size))
@@ -181,11 +181,11 @@ class Demo:
         folder = check_folder(self.output)
         names = ("avatar.safetensors", "talk.mp4", "sheet.png")
         avatar_file, video, picture = (check_output(folder / name, Path(name).suffix) for name in names)
-        from uika.acting import get_motion
         from uika.avatar.frame_renderer import film
         from uika.avatar.rendering import check_renderer
         from uika.head import load_head
         from uika.io.video import write_png, write_video
+        from uika.motion.presets import get_motion
         from uika.reconstruction import reconstruct
         from uika.safeguards import mark, picture_provenance, stamped
         from uika.sheet import reconstruction_sheet

@@ -46,10 +46,10 @@ class Export:
         """Read, pose, write."""
         kind = self.output.suffix.lower()
         self._check(kind)
-        from uika.acting import get_motion
         from uika.avatar import Avatar
         from uika.export import thinned
         from uika.head import load_head
+        from uika.motion.presets import get_motion
 
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)

@@ -93,9 +93,8 @@ class Track:
         """Track and save."""
         target = check_output(self.output, self.output.suffix if self.output.suffix in (".csv", ".json") else ".npz")
         picture = None if self.preview is None else check_output(self.preview, ".mp4")
-        from uika.exchange import write_csv, write_json
         from uika.head import load_head
-        from uika.motion import save_motion
+        from uika.motion import save_motion, write_csv, write_json
         from uika.tracking import track_video, write_preview
 
         head = load_head()

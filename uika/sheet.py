@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from uika.acting import EXPRESSIONS, expression_vector
 from uika.avatar.rendering import neutral_camera, render
 from uika.head import Camera, HeadModel, HeadParameters
 from uika.io.video import to_bytes
+from uika.motion.presets import EXPRESSIONS, expression_vector
 from uika.reconstruction import Reconstruction
 
 _YAWS = (-60.0, -30.0, 30.0, 60.0)  # degrees

@@ -35,11 +35,11 @@ class View:
         """Serve until interrupted."""
         if not 1024 <= self.port <= 65535:
             raise UikaError(f"port must lie between 1024 and 65535, not {self.port}")
-        from uika.acting import get_motion
         from uika.avatar import Avatar
         from uika.avatar.rendering import check_renderer
         from uika.export import thinned
         from uika.head import load_head
+        from uika.motion.presets import get_motion
         from uika.viewer import CameraFace, Viewer
 
         avatar, head = Avatar.load(self.avatar), load_head()

@@ -8,7 +8,7 @@ from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, AvatarError, HeadModel, HeadParameters, load_head
 from uika.avatar.avatar import FORMAT, VERSION
-from uika.canonical.prior import suppose
+from uika.canonical.prior import prior_colors
 from uika.canonical.surface import mirror_map, surface_texels
 from uika.head import uv_texels
 
@@ -178,7 +178,7 @@ def test_unseen_parts_take_the_colour_of_their_kind():
     known = (points[:, 2] > 0.0)[:, None].float()
     offset = torch.zeros_like(head.template)
     supposed = binding.from_map(
-        suppose(head, binding, offset, binding.to_map(color), binding.to_map(known)[0], brightness=1.0)
+        prior_colors(head, binding, offset, binding.to_map(color), binding.to_map(known)[0], brightness=1.0)
     )
     crown = (points[:, 2] < -0.11) & (points[:, 1] > 0.03)
     neck = (points[:, 2] < -0.02) & (points[:, 1] < -0.1)

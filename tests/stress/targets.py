@@ -22,11 +22,21 @@ from uika import Avatar
 from uika.avatar import AvatarError
 from uika.data import DataError, open_capture, shard_samples, write_shard
 from uika.data.encode import encode_pixels
-from uika.exchange import read_csv, read_flame_params, read_json, write_csv, write_flame_params, write_json
 from uika.head import HeadError, load_head, save_head
 from uika.head.actions import ARKIT_ACTIONS
 from uika.head_import.unpickle import UnpickleError, read_arrays
-from uika.motion import Motion, MotionError, load_motion, save_motion
+from uika.motion import (
+    Motion,
+    MotionError,
+    load_motion,
+    read_csv,
+    read_flame_params,
+    read_json,
+    save_motion,
+    write_csv,
+    write_flame_params,
+    write_json,
+)
 from uika.photo import PhotoError
 from uika.photo.read import read
 

@@ -18,10 +18,9 @@ import pytest
 
 from uika.avatar import Avatar, AvatarError
 from uika.data import DataError, open_capture, read_shard
-from uika.exchange import read_json
 from uika.head_import.unpickle import UnpickleError, read_arrays
 from uika.io.npz import ArraysError, read_npz
-from uika.motion import MotionError
+from uika.motion import MotionError, read_json
 
 from .fuzz import fuzz
 from .targets import TARGETS, captures

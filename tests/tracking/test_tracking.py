@@ -9,16 +9,15 @@ import torch
 
 from tests.filmed import FPS, GAP, act
 from tests.flame_files import flame_arrays
-from uika.acting import get_motion
 from uika.cli import main
-from uika.exchange import read_motion
 from uika.head import HeadModel, load_head, pose_vertices, rodrigues
 from uika.head_import.flame_file import read_flame
 from uika.head_import.landmark_embedding import nearest
 from uika.io.video import write_video
-from uika.motion import load_motion
+from uika.motion import load_motion, read_motion
+from uika.motion.presets import get_motion
+from uika.motion.retargeting import transfer
 from uika.tracking import VideoError, track_video
-from uika.transfer import transfer
 
 
 @pytest.fixture(scope="module")

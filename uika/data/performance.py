@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
-from uika.acting import EXPRESSIONS, expression_vector
 from uika.head import Camera, HeadModel, HeadParameters, look_at
+from uika.motion.presets import EXPRESSIONS, expression_vector
 
 # Yaw and pitch in degrees of the fixed viewpoints, the most useful first; more follow on a spiral.
 VIEWPOINTS = ((0, 0), (32, 3), (-32, 3), (62, 0), (-62, 0), (12, 26), (-14, -18), (105, 6), (-105, 6))
@@ -17,7 +17,7 @@ _JITTER = (4.0, 3.0)  # degrees of yaw and pitch
 _TARGET = (0.0, -0.012, -0.03)  # metres, between face and hair
 _FIELD = (0.3, 0.4)  # metres of the scene that the frame's height shows at the head
 _FOV = (12.0, 26.0)  # degrees
-# What the key expressions are made of, besides `uika.acting.EXPRESSIONS`: wilder faces than speech has.
+# What the key expressions are made of, besides `uika.motion.presets.EXPRESSIONS`: wilder faces than speech has.
 _EXTREMES: tuple[dict[str, float], ...] = (
     {"jawOpen": 0.9, "browInnerUp": 0.9, "browOuterUp": 0.8, "eyeWide": 1.0},
     {"jawOpen": 0.5, "mouthSmile": 1.0, "cheekSquint": 0.9, "mouthUpperUp": 0.5, "mouthLowerDown": 0.4},

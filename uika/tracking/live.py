@@ -12,7 +12,7 @@ from uika.fitting.frame_fit import FrameModel, Pose, fit_frame, frame_model, sta
 from uika.fitting.landmarks import eye_distance, fit_landmarks
 from uika.head import HeadModel, HeadParameters
 from uika.head.axis_angle import Array
-from uika.retime import MIN_CUTOFF, SPEED_GAIN
+from uika.motion.smoothing import MIN_CUTOFF, SPEED_GAIN
 from uika.tracking.poses import poses_to_motion
 
 LEARNING_FRAMES = 8  # with a face: the person's shape and the focal length come from these
@@ -76,7 +76,7 @@ class FaceFollower:
 
 
 class _Smooth:
-    """The 1-euro filter of one quantity (see `uika.retime`), forwards only, for steps of any length."""
+    """The 1-euro filter of one quantity (see `uika.motion.smoothing`), forwards only, for steps of any length."""
 
     def __init__(self, value: Tensor, gain: float) -> None:
         self._kept, self._speed, self._gain = value, torch.zeros_like(value), gain

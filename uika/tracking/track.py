@@ -20,7 +20,7 @@ from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array
 from uika.io.progress import counted
 from uika.motion import Motion
-from uika.retime import smoothed
+from uika.motion.smoothing import smoothed
 from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_person
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate
 from uika.tracking.poses import poses_to_motion, without_gaps

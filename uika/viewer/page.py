@@ -63,7 +63,7 @@ class Viewer:
             import viser
         except ModuleNotFoundError as error:
             raise UikaError('the viewer needs viser; run: pip install "uika-drjit[view]"') from error
-        from uika.acting import get_motion
+        from uika.motion.presets import get_motion
 
         self._head, self._camera, self._watermark = head, camera, watermark
         self._motion = get_motion("talk", head) if motion is None else motion

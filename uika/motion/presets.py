@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from uika.exchange.read import KINDS, read_motion
 from uika.head import HeadModel
-from uika.motion import Motion, MotionError
+from uika.motion.motion import Motion, MotionError
+from uika.motion.read import KINDS, read_motion
 
 Actions = Mapping[str, float]  # ARKit action -> activation; a name without side stands for both sides
 
@@ -118,7 +118,7 @@ def get_motion(name: str, head: HeadModel, fps: float | None = None, source: Hea
     """A built-in motion by name, or the motion file at that path.
 
     Args:
-        name: "orbit", "talk", "expressions", or the path of a motion for `uika.exchange.read_motion`.
+        name: "orbit", "talk", "expressions", or the path of a motion for `uika.motion.read_motion`.
         head: the head model to move.
         fps: frames per second; None means 25 for the built-in motions and the file's own rate.
         source: the FLAME head that FLAME parameters belong to, if `head` is none.

@@ -4,7 +4,7 @@ import torch
 
 from tests.heads import sphere_head
 from uika import HeadModel, Motion, MotionError, get_motion, load_head, load_motion
-from uika.acting import EXPRESSIONS, MOTIONS, expression_vector
+from uika.motion.presets import EXPRESSIONS, MOTIONS, expression_vector
 
 
 @pytest.fixture(scope="module")

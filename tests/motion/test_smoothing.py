@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from uika.motion import Motion
-from uika.retime import one_euro, smoothed
+from uika.motion.smoothing import one_euro, smoothed
 
 
 def still(frames: int) -> dict[str, torch.Tensor]:

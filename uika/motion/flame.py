@@ -11,7 +11,7 @@ from torch import Tensor
 
 from uika.io.files import check_output, replacing
 from uika.io.npz import ArraysError, read_npz
-from uika.motion import Motion, MotionError
+from uika.motion.motion import Motion, MotionError
 
 FPS = 25.0  # the files do not say
 _SHAPES = 300

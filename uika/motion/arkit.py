@@ -14,7 +14,7 @@ from torch import Tensor
 
 from uika.head.actions import ARKIT_ACTIONS
 from uika.io.files import check_output, replacing
-from uika.motion import Motion, MotionError
+from uika.motion.motion import Motion, MotionError
 
 FPS = 60.0  # of phones, where the file does not say
 _HEAD_ANGLES = ("headYaw", "headPitch", "headRoll")

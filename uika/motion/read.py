@@ -8,11 +8,11 @@ from pathlib import Path
 from torch import Tensor
 
 from uika.assets import HEAD
-from uika.exchange.arkit import read_csv, read_json
-from uika.exchange.flame import is_flame_params, read_flame_params
 from uika.head import HeadModel, load_head
 from uika.head.actions import ARKIT_ACTIONS, has_actions
-from uika.motion import Motion, MotionError, load_motion
+from uika.motion.arkit import read_csv, read_json
+from uika.motion.flame import is_flame_params, read_flame_params
+from uika.motion.motion import Motion, MotionError, load_motion
 
 KINDS = (".npz", ".csv", ".json")
 
@@ -22,7 +22,7 @@ def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = No
 
     Known are our own `.npz`; FLAME parameters, one `.npz` with `expr` [T,E] or a folder with one for each frame; ARKit
     `.csv` (Live Link Face) and `.json` (named activations). Expressions of another kind than the head's are
-    transferred with `uika.transfer`.
+    transferred with `uika.motion.retargeting`.
 
     Args:
         path: file or folder.
@@ -46,7 +46,7 @@ def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = No
 
 def _from_actions(motion: Motion, head: HeadModel) -> Motion:
     if not has_actions(head):
-        from uika.transfer import transfer
+        from uika.motion.retargeting import transfer
 
         builtin = load_head(HEAD)
         return transfer(_from_actions(motion, builtin), builtin, head)
@@ -63,7 +63,7 @@ def _from_flame(motion: Motion, head: HeadModel, source: HeadModel | None, place
             f"{place}: holds FLAME expressions, but the head model '{head.id}' has ARKit actions; also give the FLAME "
             "head that they belong to (`uika head import` makes it from FLAME's own file)"
         )
-    from uika.transfer import transfer
+    from uika.motion.retargeting import transfer
 
     return transfer(replace(motion, expression=_padded(motion.expression, source, place)), source, head)
 

@@ -8,11 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from uika.acting import get_motion
-from uika.exchange import read_csv, read_flame_params, read_json, read_motion, write_csv, write_flame_params, write_json
 from uika.head import HeadModel, load_head, rodrigues
 from uika.head.actions import ARKIT_ACTIONS, has_actions
-from uika.motion import Motion, MotionError, load_motion, save_motion
+from uika.motion import (
+    Motion,
+    MotionError,
+    load_motion,
+    read_csv,
+    read_flame_params,
+    read_json,
+    read_motion,
+    save_motion,
+    write_csv,
+    write_flame_params,
+    write_json,
+)
+from uika.motion.presets import get_motion
 
 
 @pytest.fixture(scope="module")

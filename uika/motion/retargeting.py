@@ -19,7 +19,7 @@ from uika.fitting.frame_fit import (
 from uika.head import HeadModel, HeadParameters, pose_vertices
 from uika.head.actions import fitted_joints
 from uika.head.axis_angle import Array, axis_angle, rotation
-from uika.motion import Motion, MotionError
+from uika.motion.motion import Motion, MotionError
 
 NOISE = 5e-4  # metres; weighs the landmarks against the prior of 1 on each squared coefficient
 MIN_SHARED = 50  # landmarks

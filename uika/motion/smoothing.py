@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from uika.motion import Motion
+from uika.motion.motion import Motion
 
 MIN_CUTOFF = 5.0  # hertz: what moves slower is noise unless it moves far
 SPEED_GAIN = {  # how much faster things may pass, hertz per unit and second
