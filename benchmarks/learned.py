@@ -20,6 +20,9 @@ from benchmarks.harness import markdown, save
 from uika.avatar import Avatar
 from uika.canonical.surface import surface_texels
 from uika.data import Capture
+from uika.data.datasets import find_people, open_person
+from uika.data.texture import true_texture
+from uika.data.views import View
 from uika.evaluate.heads import drive, observe_sources, target_views, truth_picture
 from uika.evaluate.protocol import TURNED_AWAY, Protocol
 from uika.evaluate.score import Judges, Pictures, mean, score
@@ -27,9 +30,6 @@ from uika.evaluate.sequences import facing
 from uika.head import HeadModel, load_head, uv_texels
 from uika.io.progress import counted
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, load_model
-from uika.train.crops import View
-from uika.train.people import find_people, open_person
-from uika.train.texture import true_texture
 from uika.uv import aggregate, diffuse
 
 SOURCE_CAMERAS = ("00", "01", "02", "03", "04", "05")

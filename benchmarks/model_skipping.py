@@ -29,6 +29,8 @@ from benchmarks.model_inputs import make_views
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
+from uika.data.datasets import find_people
+from uika.data.views import View
 from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
 from uika.fitting import Fit, pixel_uv
@@ -38,8 +40,6 @@ from uika.io.video import write_png
 from uika.metrics import psnr
 from uika.model import CanonicalGaussians, Keep, Reconstructor, Session
 from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
-from uika.train.crops import View
-from uika.train.people import find_people
 
 SIZE = 256  # pixels of people's photos and of the pictures that are compared
 TARGETS = 8

@@ -14,6 +14,7 @@ from PIL import Image
 from tests.metrics.lpips_files import write_weights
 from tests.metrics.onnx_files import write_flatten
 from uika.cli import main
+from uika.data.views import View
 from uika.errors import UikaError
 from uika.evaluate import Evaluation, evaluate, evaluate_all, gather, write_report
 from uika.evaluate.external import external_file
@@ -22,7 +23,6 @@ from uika.evaluate.sequences import choose_frames
 from uika.head import load_head
 from uika.io.video import write_png
 from uika.metrics.arcface import SIDE
-from uika.train.crops import View
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from tests.train.common import CONFIG, SIZE, PaintedPeople, PaintedPerson
+from uika.data.views import View
 from uika.head import load_head, look_at, pose_vertices, project
 from uika.head.alignment import aligned_camera
 from uika.head.parameters import HeadParameters
 from uika.train import Draw, ItemMaker
 from uika.train.augment import degrade, draw_grade
-from uika.train.crops import View
 
 AUGMENTED = replace(CONFIG, augment=True)
 

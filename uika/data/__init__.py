@@ -5,7 +5,7 @@ from uika.data.prepare import PreparedView, prepare_reference, prepare_view, ref
 from uika.data.quality import WarpingErrors, warping_errors
 from uika.data.sample import DataError, Sample
 from uika.data.shards import read_shard, shard_samples, write_shard
-from uika.data.synthesize import Synthesis, SynthesisReport, synthesize
+from uika.data.synthesis import Synthesis, SynthesisReport, synthesize
 
 __all__ = [
     "Capture",

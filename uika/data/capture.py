@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uika.data.parts import Frame, build_sample, read_arrays
+from uika.data.decoding import Frame, build_sample, read_arrays
 from uika.data.sample import DataError, Sample
 
 DESCRIPTION = "transforms.json"

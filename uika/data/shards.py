@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from uika.data.capture import parse_frame
-from uika.data.parts import build_sample, read_arrays
+from uika.data.decoding import build_sample, read_arrays
 from uika.data.sample import DataError, Sample
 from uika.io.files import replacing
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.data import Sample
+from uika.data.views import View
 from uika.evaluate.protocol import Protocol
 from uika.evaluate.sequences import check_sample
 from uika.fitting import Fit
@@ -31,7 +32,6 @@ from uika.reconstruction import (
     fit_prepared,
     prepare_file,
 )
-from uika.train.crops import View
 
 _PHOTO_SIDE = 512  # pixels of photos for networks that take any
 

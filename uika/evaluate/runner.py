@@ -13,6 +13,8 @@ from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.data import DataError
+from uika.data.datasets import find_people
+from uika.data.views import View
 from uika.errors import UikaError
 from uika.evaluate.external import check_external, external_picture
 from uika.evaluate.heads import Cutouts, drive, make_avatar, target_views, truth_picture
@@ -38,8 +40,6 @@ from uika.metrics.arcface import ArcFace
 from uika.metrics.lpips import Lpips
 from uika.photo import PhotoError
 from uika.reconstruction import MAX_PHOTOS, LoadedModel, load_model
-from uika.train.crops import View
-from uika.train.people import find_people
 
 TRUTHS = 4  # sequences whose targets are remembered
 SHOWN = 2  # targets of each result that pictures are kept of

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from uika.data import Capture, DataError, Sample
+from uika.data.datasets import Person, open_person
 from uika.evaluate.protocol import TURNED_AWAY
 from uika.head import HeadModel, rodrigues
 from uika.reconstruction import MAX_PHOTOS
-from uika.train.people import Person, open_person
 
 Place = tuple[int, str]  # time step and camera
 

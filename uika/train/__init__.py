@@ -1,11 +1,11 @@
 """Training of the reconstructor and of the correspondence estimator."""
 
+from uika.data.datasets import SYNTHETIC, Stored, Synthetic
 from uika.train.config import TRAINING, LossWeights, TrainConfig
 from uika.train.export import load_estimator
 from uika.train.items import Item, ItemMaker
 from uika.train.loop import MODEL_FILE, Setup, TrainingError, train
 from uika.train.parallel import Group, join_group, leave_group
-from uika.train.people import SYNTHETIC, Stored, Synthetic
 from uika.train.sampler import Draw, Sampler, SamplerConfig
 from uika.train.schedule import batch_size, learning_rate
 

@@ -11,16 +11,16 @@ from torch import Tensor
 
 from uika.canonical.surface import surface_texels
 from uika.data import DataError
+from uika.data.datasets import People, Person
+from uika.data.texture import true_texture
+from uika.data.views import View
 from uika.feeding import model_inputs
 from uika.fitting import Fit, fit_photos, pixel_uv
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
 from uika.head.alignment import align, aligned_camera
 from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
-from uika.train.crops import View
-from uika.train.people import People, Person
 from uika.train.sampler import Draw
-from uika.train.texture import true_texture
 
 _MIN_FACING = 0.25  # cosine between face and camera of a photo that somebody would use
 _TRIES = 3  # people tried in the place of one that cannot be read

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from uika.data.datasets import People
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 from uika.metrics.lpips import Lpips
@@ -24,7 +25,6 @@ from uika.train.items import Item, ItemMaker
 from uika.train.logbook import Clock, Logbook
 from uika.train.optimiser import RunningMean, make_optimizer
 from uika.train.parallel import Group, Sharding, distribute
-from uika.train.people import People
 from uika.train.sampler import Draw, Sampler, SamplerConfig
 from uika.train.schedule import learning_rate
 from uika.train.tasks import Task, blocks, judge, make_task, recompute_activations

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from tests.train.common import CONFIG, MICRO, PaintedPerson, run
+from uika.data.texture import true_texture
+from uika.data.views import View
 from uika.head import load_head, uv_texels
 from uika.model import load_checkpoint
 from uika.train import MODEL_FILE, LossWeights
-from uika.train.crops import View
 from uika.train.tasks import ReconstructionTask
-from uika.train.texture import true_texture
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*tensorboard.*:DeprecationWarning")
 

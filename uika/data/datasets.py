@@ -11,7 +11,7 @@ from typing import Protocol
 
 from uika.data import DataError, Sample, open_capture
 from uika.data.capture import DESCRIPTION, parse_frame
-from uika.data.parts import build_sample, read_arrays
+from uika.data.decoding import build_sample, read_arrays
 from uika.data.shards import EXTENSIONS
 from uika.errors import UikaError
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from uika.train.crops import SOLID, View
+from uika.data.views import SOLID, View
 from uika.uv import accumulate, pool
 
 
