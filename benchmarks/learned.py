@@ -23,8 +23,8 @@ from uika.data import Capture
 from uika.data.datasets import find_people, open_person
 from uika.data.texture import true_texture
 from uika.data.views import View
-from uika.evaluate.heads import drive, observe_sources, target_views, truth_picture
 from uika.evaluate.protocol import TURNED_AWAY, Protocol
+from uika.evaluate.reenactment import drive, observe_sources, target_views, truth_picture
 from uika.evaluate.score import Judges, Pictures, mean, score
 from uika.evaluate.sequences import facing
 from uika.head import HeadModel, load_head, uv_texels

@@ -31,7 +31,7 @@ from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.data.datasets import find_people
 from uika.data.views import View
-from uika.evaluate.heads import drive, observe_sources, rounded, truth_picture
+from uika.evaluate.reenactment import drive, observe_sources, rounded, truth_picture
 from uika.feeding import ModelInputs, model_inputs
 from uika.fitting import Fit, pixel_uv
 from uika.growing import GrowingAvatar

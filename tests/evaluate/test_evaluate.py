@@ -18,7 +18,7 @@ from uika.data.views import View
 from uika.errors import UikaError
 from uika.evaluate import Evaluation, evaluate, evaluate_all, gather, write_report
 from uika.evaluate.external import external_file
-from uika.evaluate.heads import truth_picture
+from uika.evaluate.reenactment import truth_picture
 from uika.evaluate.sequences import choose_frames
 from uika.head import load_head
 from uika.io.video import write_png

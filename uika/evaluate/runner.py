@@ -17,8 +17,8 @@ from uika.data.datasets import find_people
 from uika.data.views import View
 from uika.errors import UikaError
 from uika.evaluate.external import check_external, external_picture
-from uika.evaluate.heads import Cutouts, drive, make_avatar, target_views, truth_picture
 from uika.evaluate.protocol import Protocol
+from uika.evaluate.reenactment import Cutouts, drive, make_avatar, target_views, truth_picture
 from uika.evaluate.score import Judges, Pictures, faces_found, score
 from uika.evaluate.sequences import Sequence, choose_frames
 from uika.evaluate.store import (
