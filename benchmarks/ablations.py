@@ -21,7 +21,7 @@ from uika.io.progress import counted
 from uika.metrics import flip, psnr, ssim
 from uika.model import PRESETS, load_checkpoint
 from uika.train import MODEL_FILE, TRAINING, Group, Setup, Stored, TrainConfig, train
-from uika.train.items import ItemMaker
+from uika.train.dataset import ItemMaker
 from uika.train.sampler import Draw
 from uika.train.tasks import ReconstructionTask
 

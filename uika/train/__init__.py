@@ -2,12 +2,12 @@
 
 from uika.data.datasets import SYNTHETIC, Stored, Synthetic
 from uika.train.config import TRAINING, LossWeights, TrainConfig
+from uika.train.dataset import Item, ItemMaker
 from uika.train.export import load_estimator
-from uika.train.items import Item, ItemMaker
 from uika.train.loop import MODEL_FILE, Setup, TrainingError, train
+from uika.train.optimiser import batch_size, learning_rate
 from uika.train.parallel import Group, join_group, leave_group
 from uika.train.sampler import Draw, Sampler, SamplerConfig
-from uika.train.schedule import batch_size, learning_rate
 
 __all__ = [
     "MODEL_FILE",

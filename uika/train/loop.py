@@ -20,13 +20,12 @@ from uika.metrics.lpips import Lpips
 from uika.model import computes_bfloat16
 from uika.train.checkpoint import Checkpoints, Progress, read_progress
 from uika.train.config import TrainConfig
+from uika.train.dataset import Item, ItemMaker
 from uika.train.export import export, load_start
-from uika.train.items import Item, ItemMaker
 from uika.train.logbook import Clock, Logbook
-from uika.train.optimiser import RunningMean, make_optimizer
+from uika.train.optimiser import RunningMean, learning_rate, make_optimizer
 from uika.train.parallel import Group, Sharding, distribute
 from uika.train.sampler import Draw, Sampler, SamplerConfig
-from uika.train.schedule import learning_rate
 from uika.train.tasks import Task, blocks, judge, make_task, recompute_activations
 
 MODEL_FILE = "model.safetensors"

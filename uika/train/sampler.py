@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uika.train.schedule import batch_size
+from uika.train.optimiser import batch_size
 
 _STREAMS = {"sources": 0, "order": 1, "item": 2}
 

@@ -15,7 +15,7 @@ from uika.head import HeadModel, pose_gaussians, uv_texels
 from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
 from uika.train.config import TrainConfig
-from uika.train.items import Item
+from uika.train.dataset import Item
 from uika.train.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
 
 
