@@ -25,13 +25,13 @@ from torch import Tensor
 from benchmarks.figures import bars
 from benchmarks.harness import interleaved, markdown, save
 from benchmarks.learned import frames_of
-from benchmarks.model_inputs import make_views
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.data.datasets import find_people
 from uika.data.views import View
 from uika.evaluate.reenactment import drive, observe_sources, rounded, truth_picture
+from uika.evaluate.rendered_views import make_views
 from uika.feeding import ModelInputs, model_inputs
 from uika.fitting import Fit, pixel_uv
 from uika.growing import GrowingAvatar

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import get_args
 
-from uika.commands import Command
-from uika.motion_commands import ImportHead, ShowHead
+from uika.cli.commands import Command
+from uika.cli.head import ImportHead, ShowHead
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))

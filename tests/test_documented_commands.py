@@ -22,7 +22,7 @@ import uika
 from tests.documented import PAGES, ROOT, examples, mentioned, shown
 from tests.filmed import act
 from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
-from uika.cli import _parse, main
+from uika.cli.program import _parse, main
 from uika.export import posed_splats, write_ply
 from uika.safeguards import mark, picture_provenance
 

@@ -18,8 +18,8 @@ from uika import (
     write_video,
 )
 from uika.avatar.rendering import motion_cameras
+from uika.cli.contact_sheet import contact_sheet
 from uika.io.video import to_bytes
-from uika.sheet import contact_sheet
 
 SIZE = 96
 

@@ -85,3 +85,20 @@ def _head() -> Finding:
     except (ImportError, ValueError) as error:
         return Finding("head model", "unusable", str(error))
     return Finding("head model", f"{head.id} ({len(head.template)} vertices, {len(head.expression_names)} expressions)")
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show versions, LLVM, threads and what is missing; exit 1 if something needed is.
+
+    Example: uika doctor
+    """
+
+    def run(self) -> int:
+        """Print the findings."""
+        findings = examine()
+        for finding in findings:
+            print(f"{finding.subject:<12} {finding.value}")
+            if finding.remedy and finding.value in ("missing", "unusable"):
+                print(f"{'':<12} {'needed' if finding.needed else 'optional'}: {finding.remedy}")
+        return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))

@@ -18,7 +18,7 @@ from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, load_head
 from uika.cli import main
-from uika.commands import Command
+from uika.cli.commands import Command
 from uika.head import save_head
 
 

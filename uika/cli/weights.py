@@ -1,27 +1,8 @@
-"""The commands that look at what is installed; each dataclass is one command's arguments."""
+"""The command `uika weights`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class Doctor:
-    """Show versions, LLVM, threads and what is missing; exit 1 if something needed is.
-
-    Example: uika doctor
-    """
-
-    def run(self) -> int:
-        """Print the findings."""
-        from uika.doctor import examine
-
-        findings = examine()
-        for finding in findings:
-            print(f"{finding.subject:<12} {finding.value}")
-            if finding.remedy and finding.value in ("missing", "unusable"):
-                print(f"{'':<12} {'needed' if finding.needed else 'optional'}: {finding.remedy}")
-        return int(any(finding.needed and finding.value in ("missing", "unusable") for finding in findings))
 
 
 @dataclass(frozen=True)

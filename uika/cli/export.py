@@ -1,4 +1,4 @@
-"""The command that writes avatars for other programs."""
+"""The command `uika export`."""
 
 from __future__ import annotations
 

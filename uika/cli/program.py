@@ -114,8 +114,8 @@ def _choose_head(arguments: list[str]) -> list[str]:
 
 def _overview(asked: bool) -> int:
     _need_tyro()
-    from uika.commands import Command
-    from uika.overview import overview
+    from uika.cli.commands import Command
+    from uika.cli.help import overview
 
     print(overview(Command), file=sys.stdout if asked else sys.stderr)
     return 0 if asked else _WRONG_INPUT
@@ -123,7 +123,7 @@ def _overview(asked: bool) -> int:
 
 def _parse(arguments: list[str]) -> Any:
     tyro = _need_tyro()
-    from uika.commands import Command
+    from uika.cli.commands import Command
 
     return tyro.cli(Command, prog="uika", args=arguments, config=(tyro.conf.OmitArgPrefixes,))
 

@@ -1,0 +1,63 @@
+"""The command `uika reconstruct`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from uika.cli.stage_seconds import print_seconds
+from uika.errors import UikaError
+from uika.io.files import check_output
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Make an avatar from photos of one person.
+
+    Example: uika reconstruct front.jpg side.jpg -o me.safetensors
+    """
+
+    photos: Positional[tuple[Path, ...]]
+    """1 to 64 photos that show the face."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("avatar.safetensors")
+    """The avatar file to write."""
+    model: str = "tiny"
+    """tiny, none, or a trained model file."""
+    refine: bool = True
+    """Refine face shape and poses with the colours that two or more photos share."""
+    keep: Literal["all", "foreground"] = "all"
+    """foreground leaves out patches without head: quicker from several photos, nearly the same."""
+    consent: bool = False
+    """State in the avatar's provenance that the person shown agrees."""
+
+    def run(self) -> int:
+        """Reconstruct and save."""
+        target = check_output(self.output, ".safetensors")
+        _check_photos(self.photos)
+        from uika.reconstruction import reconstruct
+        from uika.safeguards import stamped
+
+        result = reconstruct(self.photos, model=self.model, refine=self.refine, keep=self.keep)
+        stamped(result.avatar, consent=self.consent).save(target)
+        print_seconds(result.report)
+        if result.fit.gain:
+            print(f"refined: {result.fit.gain}")
+        print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
+        return 0
+
+
+def _check_photos(photos: tuple[Path, ...]) -> None:
+    if not photos:
+        raise UikaError("give at least one photo, for example: uika reconstruct me.jpg")
+    for path in photos:
+        if path.is_dir():
+            raise UikaError(f"{path}: is a directory; give the photos in it one by one")
+        if not path.is_file():
+            raise UikaError(f"{path}: no such photo")
+
+
+def _photos(count: int) -> str:
+    return "1 photo" if count == 1 else f"{count} photos"
