@@ -32,14 +32,13 @@ from uika.data.datasets import find_people
 from uika.data.views import View
 from uika.evaluate.reenactment import drive, observe_sources, rounded, truth_picture
 from uika.evaluate.rendered_views import make_views
-from uika.feeding import ModelInputs, model_inputs
 from uika.fitting import Fit, pixel_uv
-from uika.growing import GrowingAvatar
 from uika.head import HeadModel, HeadParameters, load_head
 from uika.io.video import write_png
 from uika.metrics import psnr
 from uika.model import CanonicalGaussians, Keep, Reconstructor, Session
-from uika.reconstruction import LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
+from uika.reconstruction import GrowingAvatar, LoadedModel, Report, avatar_from_fit, fit_files, load_model, reconstruct
+from uika.reconstruction.model_inputs import ModelInputs, model_inputs
 
 SIZE = 256  # pixels of people's photos and of the pictures that are compared
 TARGETS = 8

@@ -14,18 +14,17 @@ if TYPE_CHECKING:
     from uika.avatar import Avatar, AvatarError
     from uika.avatar.rendering import Rendering, frames, neutral_camera, render
     from uika.errors import UikaError
-    from uika.growing import GrowingAvatar
     from uika.head import Camera, HeadModel, HeadParameters, load_head
     from uika.io.video import write_png, write_video
     from uika.motion import Motion, MotionError, load_motion
     from uika.motion.presets import get_motion
-    from uika.reconstruction import Reconstruction, reconstruct
+    from uika.reconstruction import GrowingAvatar, Reconstruction, reconstruct
 
 _HOMES = {
     "Avatar": "avatar",
     "AvatarError": "avatar",
     "Camera": "head",
-    "GrowingAvatar": "growing",
+    "GrowingAvatar": "reconstruction",
     "HeadModel": "head",
     "HeadParameters": "head",
     "Motion": "motion",

@@ -88,7 +88,8 @@ def observe_sources(
     """
     if correspondence == "fit":
         cutouts = cutouts or Cutouts()
-        return Observed(*fit_prepared([cutouts.photo(sample) for sample in sources], head)[1:])
+        found = fit_prepared([cutouts.photo(sample) for sample in sources], head)
+        return Observed(found.fit, found.images, found.mattes, found.digests)
     for sample in sources:
         check_sample(sample, head)
     views = [View(sample, size) for sample in sources]

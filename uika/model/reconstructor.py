@@ -13,7 +13,7 @@ from uika.model.decoder import GaussianDecoder
 from uika.model.dpt import resize
 from uika.model.fusion import Encoder
 from uika.model.gaussians import CanonicalGaussians
-from uika.model.observation import Observation, observe
+from uika.model.observation import observe
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.transformer import ContextMemory, MMTransformer
 from uika.model.view_features import EMPTY, FeatureCache, Keep, ViewFeatures, content_keys, covered_tokens, occupied
@@ -158,26 +158,13 @@ class Reconstructor(nn.Module):
         )
 
     @torch.no_grad()
-    def observe(
-        self,
-        images: Tensor,
-        masks: Tensor,
-        pixel_uv: Tensor,
-        pixel_weight: Tensor | None,
-        texel: Tensor,
-        surface: SurfaceTexels,
-    ) -> Observation:
-        """The part without learned weights, of one head: reprojection, aggregation and filling.
-
-        Arguments as in `forward`; B is 1.
-        """
+    def sums(self, images: Tensor, masks: Tensor, pixel_uv: Tensor, pixel_weight: Tensor | None) -> list[Sums]:
+        """What each view of one head adds to the aggregate [C,S,S]; arguments as in `forward`, B is 1."""
         config = self.config.uv
         weights = pixel_weight if config.grid == "centers" else None
         size = self.config.map_size
         sums = accumulate(images, pixel_uv, masks, size, config.grid, weights, oversample=config.oversample)
-        return observe(
-            config, [Sums(*(part[0, view] for part in sums)) for view in range(images.shape[1])], texel, surface
-        )
+        return [Sums(*(part[0, view] for part in sums)) for view in range(images.shape[1])]
 
     def view_size(self, images: Tensor) -> tuple[int, int]:
         """Height and width at which the backbone sees photos [...,H,W]; reprojected ones are squares of the height."""

@@ -14,10 +14,10 @@ from uika.data import DataError
 from uika.data.datasets import People, Person
 from uika.data.texture import true_texture
 from uika.data.views import View
-from uika.feeding import model_inputs
 from uika.fitting import Fit, fit_photos, pixel_uv
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project, rodrigues, shaped_vertices
 from uika.head.alignment import align, aligned_camera
+from uika.reconstruction.model_inputs import model_inputs
 from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
 from uika.train.sampler import Draw

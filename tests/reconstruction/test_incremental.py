@@ -56,5 +56,11 @@ def test_a_photo_that_cannot_be_used_changes_nothing(photos: list[Path], head: H
     assert len(growing) == 1
     with pytest.raises(UikaError, match="1 to 63 more photos"):
         growing.add([])
-    with pytest.raises(UikaError, match="none"):
-        GrowingAvatar("none", head)
+
+
+def test_the_untrained_way_grows_too(photos: list[Path], head: HeadModel) -> None:
+    growing = GrowingAvatar("none", head)
+    first = growing.add(photos[:1])
+    assert_same_avatar(first, reconstruct(photos[:1], head, "none").avatar)
+    assert (growing.add(photos[2:]).colors - first.colors).abs().max() > 0.05
+    assert_same_avatar(growing.refresh(), reconstruct([photos[0], *photos[2:]], head, "none").avatar)

@@ -1,0 +1,86 @@
+"""One person's canonical head from photos; what was computed for each photo is kept, so that more can be added."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from uika.canonical.surface import surface_texels
+from uika.head import HeadModel
+from uika.reconstruction.models import LoadedModel
+from uika.reconstruction.report import Report
+
+if TYPE_CHECKING:
+    from uika.fitting import Fit
+    from uika.model import Keep
+    from uika.uv import Sums
+
+_UNTRAINED_OPACITY = 0.95
+
+
+class CanonicalHead:
+    """The surface of one fitted person, and the photos whose colours and features it has taken in."""
+
+    def __init__(
+        self, loaded: LoadedModel, head: HeadModel, fit: Fit, keep: Keep = "all", *, growing: bool = False
+    ) -> None:
+        """Prepare the surface.
+
+        Args:
+            loaded: the model.
+            head: the head model.
+            fit: says identity and hair; its photos are not added.
+            keep: as in `uika.reconstruct`.
+            growing: whether photos come in several calls of `add`, for which the network's contexts are kept.
+        """
+        from uika.model import Session
+
+        identity, config = fit.parameters.identity[0], loaded.network.config
+        self._head, self._config, self._static_offset = head, config, fit.static_offset
+        self._surface, self.binding = surface_texels(head, identity, fit.static_offset, config.map_size)
+        self._levels: list[Tensor] = []
+        self._session = Session(loaded.network, self.binding.texel, self._surface, keep, self._prior, growing=growing)
+        self._run = loaded.run
+
+    @torch.no_grad()
+    def add(self, fit: Fit, images: Tensor, mattes: Tensor, report: Report) -> tuple[Tensor, ...]:
+        """The Gaussians of all photos so far and N new ones, fitted to this identity.
+
+        Args:
+            fit: heads and cameras of the new photos.
+            images: [N,3,S,S] sRGB in [0,1] on one plain colour.
+            mattes: [N,S,S] in [0,1].
+            report: gets times and counts.
+
+        Returns:
+            Means [1,M,3], quats [1,M,4], scales [1,M,3], opacities [1,M] and colours [1,M,3].
+        """
+        from uika.fitting import pixel_uv
+        from uika.reconstruction.model_inputs import levels, plausible
+
+        with report.stage("correspondence"):
+            uv, valid, weight = pixel_uv(fit, self._head, mattes)
+            uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)[None]
+        with report.stage("reconstruction"):
+            self._levels.append(levels(images, weight))
+            weights = weight[None, :, None] * plausible(self._head, self.binding, uv)
+            views = images[None], mattes[None, :, None], uv, weights
+            if self._run:
+                result = self._session.add(*views)
+                report.counts.update(result.report)
+                return tuple(result)
+            seen = self._session.observe(*views)
+            report.counts.update(seen.report)
+            colors = seen.color.flatten(2)[:, :, self.binding.texel].mT.contiguous()
+            opacities = torch.full((1, len(self.binding)), _UNTRAINED_OPACITY)
+            return self._surface.points, self._surface.quats, self._surface.scales, opacities, colors
+
+    def _prior(self, sums: Sums) -> Tensor:
+        """Colours [3,S,S] for what no photo shows, from all photos pooled."""
+        from uika.reconstruction.model_inputs import surface_prior
+        from uika.uv import pool
+
+        shown = torch.cat(self._levels)
+        return surface_prior(self._config, self._head, self.binding, self._static_offset, pool(sums), shown)

@@ -1,0 +1,91 @@
+"""Photos of one person, and the heads and cameras fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from uika.head import HeadModel
+from uika.reconstruction.report import Report
+
+if TYPE_CHECKING:
+    from uika.fitting import Fit
+    from uika.photo import Photo
+
+
+class PreparedPhoto(NamedTuple):
+    """A photo and the matte [S,S] of its head and hair."""
+
+    photo: Photo
+    hair: Tensor
+
+
+class FittedPhotos(NamedTuple):
+    """N photos of one person and the heads and cameras fitted to them."""
+
+    photos: tuple[Photo, ...]
+    fit: Fit
+    images: Tensor  # [N,3,S,S] on one plain colour
+    mattes: Tensor  # [N,S,S] in [0,1]
+    digests: list[str]  # of the files
+
+
+def fit_files(
+    photos: Sequence[str | Path], head: HeadModel, *, refine: bool = True, report: Report | None = None
+) -> FittedPhotos:
+    """Read photos of one person and fit the head to them; they come out in the order of their content hashes.
+
+    Raises:
+        PhotoError: a photo cannot be read or shows no face; the message names it.
+    """
+    report = Report() if report is None else report
+    with report.stage("photos"):
+        prepared = [prepare_file(path) for path in photos]
+    return fit_prepared(prepared, head, refine=refine, report=report)
+
+
+def prepare_file(path: str | Path) -> PreparedPhoto:
+    """All that a photo needs before it is fitted together with others.
+
+    Raises:
+        PhotoError: it cannot be read or shows no face; the message names it.
+    """
+    from uika.photo import head_matte, prepare
+
+    photo = prepare(path)
+    return PreparedPhoto(photo, head_matte(photo))
+
+
+def fit_prepared(
+    prepared: Sequence[PreparedPhoto],
+    head: HeadModel,
+    *,
+    refine: bool = True,
+    report: Report | None = None,
+    known: Fit | None = None,
+) -> FittedPhotos:
+    """Fit the head to prepared photos of one person; they come out in the order of their content hashes.
+
+    Args:
+        prepared: N photos.
+        head: the head model.
+        refine: whether to refine the fit with the colours that the photos share.
+        report: gets the time.
+        known: an earlier fit of the person, whose identity and hair are kept.
+    """
+    from uika.fitting import fit_photos
+
+    report = Report() if report is None else report
+    ordered = sorted(prepared, key=lambda each: each.photo.sha256)
+    photos = [each.photo for each in ordered]
+    with report.stage("fit"):
+        pictures = [photo.image for photo in photos] if refine else None
+        focals = [photo.focal for photo in photos]
+        fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures, focals=focals, known=known)
+    images = torch.stack([photo.image for photo in photos])
+    mattes = torch.stack([photo.matte for photo in photos])
+    return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos])

@@ -1,0 +1,89 @@
+"""An avatar that grows photo by photo: what was computed for earlier photos is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from uika.avatar import Avatar
+from uika.errors import UikaError
+from uika.head import HeadModel, load_head
+from uika.reconstruction.canonical_head import CanonicalHead
+from uika.reconstruction.fitted_photos import PreparedPhoto, fit_prepared, prepare_file
+from uika.reconstruction.models import load_model
+from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble
+from uika.reconstruction.report import Report
+
+if TYPE_CHECKING:
+    from uika.fitting import Fit
+    from uika.model import Keep
+
+
+class GrowingAvatar:
+    """Photos of one person, added in any number of steps.
+
+    The photos of the first step decide on the person's identity and hair, and each later photo is fitted to them and
+    encoded alone. `refresh` fits and reconstructs all photos together, as `uika.reconstruct` does.
+    """
+
+    def __init__(self, model: str | Path = "tiny", head: HeadModel | None = None, keep: Keep = "all") -> None:
+        """Arguments as in `uika.reconstruct`.
+
+        Raises:
+            ValueError: the model's name or file cannot be used.
+        """
+        self._loaded = load_model(model)
+        self._head = load_head() if head is None else head
+        self._keep: Keep = keep
+        self._photos: list[PreparedPhoto] = []
+        self._first: tuple[Fit, CanonicalHead] | None = None
+
+    def __len__(self) -> int:
+        """The number of photos."""
+        return len(self._photos)
+
+    def add(self, photos: Sequence[str | Path], report: Report | None = None) -> Avatar:
+        """The avatar from all photos so far and these; nothing is added when one of them cannot be used.
+
+        Args:
+            photos: photo files, each showing the face.
+            report: gets times and counts.
+
+        Raises:
+            PhotoError: a photo cannot be read or shows no face; the message names it.
+            UikaError: there are no photos, or they become too many.
+        """
+        if not photos or len(self) + len(photos) > MAX_PHOTOS:
+            raise UikaError(f"give 1 to {MAX_PHOTOS - len(self)} more photos of one person, not {len(photos)}")
+        report = Report() if report is None else report
+        with report.stage("photos"):
+            new = [prepare_file(path) for path in photos]
+        return self._grown(self._photos, new, self._first, report)
+
+    def refresh(self, report: Report | None = None) -> Avatar:
+        """The avatar as if all photos had come at once.
+
+        Raises:
+            UikaError: there are no photos yet.
+        """
+        if not self._photos:
+            raise UikaError("there are no photos yet: add some first")
+        return self._grown([], self._photos, None, Report() if report is None else report)
+
+    def _grown(
+        self,
+        before: Sequence[PreparedPhoto],
+        new: Sequence[PreparedPhoto],
+        first: tuple[Fit, CanonicalHead] | None,
+        report: Report,
+    ) -> Avatar:
+        found = fit_prepared(new, self._head, report=report, known=None if first is None else first[0])
+        fit, canonical = first or (
+            found.fit,
+            CanonicalHead(self._loaded, self._head, found.fit, self._keep, growing=True),
+        )
+        gaussians = canonical.add(found.fit, found.images, found.mattes, report)
+        self._first, self._photos = (fit, canonical), [*before, *new]
+        digests = sorted(each.photo.sha256 for each in self._photos)
+        return assemble(self._loaded.name, self._head, fit, gaussians, canonical.binding, digests)
