@@ -39,7 +39,7 @@ from uika.head import (
     vertex_normals,
 )
 from uika.io.files import replacing
-from uika.photo.nets import face_meshes
+from uika.photo.networks import face_meshes
 
 SIZE = 512
 FACES, VIEWS = 6, 2  # expressions of each person, and views of each expression

@@ -7,7 +7,7 @@ import torch
 
 from tests.filmed import FPS, act
 from uika.head import HeadModel, load_head, rodrigues
-from uika.photo.nets import follow_meshes
+from uika.photo.networks import follow_meshes
 from uika.tracking import FaceFollower, VideoError, video_frames
 from uika.tracking.live import LEARNING_FRAMES
 from uika.viewer import CameraFace

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from uika.head import Camera, look_at, project, rasterize, vertex_normals
-from uika.photo.nets import face_meshes
+from uika.photo.networks import face_meshes
 
 from .topology import PARTS
 

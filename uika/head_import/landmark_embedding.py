@@ -30,7 +30,7 @@ def embed(head: HeadModel, colours: Tensor, keep: Tensor) -> tuple[Tensor, Tenso
     Raises:
         HeadError: the detector finds no face in most of the pictures.
     """
-    from uika.photo.nets import face_meshes
+    from uika.photo.networks import face_meshes
 
     points, faces = head.template, head.faces
     normals = vertex_normals(points, faces)

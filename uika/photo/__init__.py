@@ -2,6 +2,6 @@
 
 from uika.photo.error import PhotoError
 from uika.photo.parts import head_matte
-from uika.photo.prepare import Photo, prepare
+from uika.photo.preparation import Photo, prepare
 
 __all__ = ["Photo", "PhotoError", "head_matte", "prepare"]

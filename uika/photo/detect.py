@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.photo.crop import Square, resample, to_photo
-from uika.photo.nets import face_boxes, face_meshes
+from uika.photo.networks import face_boxes, face_meshes
 
 SCAN_SIDE = 640  # the detectors shrink their input to 192 or 128 px, so more would be lost
 LARGE_SIDE = 4 * SCAN_SIDE  # the smallest tiles need no more than this of the photo

@@ -9,7 +9,7 @@ from torch import Tensor
 from uika.photo import matte
 from uika.photo.crop import pixel_centres
 from uika.photo.outline import JAW, OVAL, face_frame, polygon
-from uika.photo.prepare import Photo
+from uika.photo.preparation import Photo
 
 EAR_LOBES = (132, 361)
 JAW_CORNERS = (172, 397)

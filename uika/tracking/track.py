@@ -119,7 +119,7 @@ def track_video(
 
 def _look(path: Path, progress: bool) -> _Seen:
     """Landmarks of all frames, and views of evenly spread key frames."""
-    from uika.photo.nets import follow_meshes
+    from uika.photo.networks import follow_meshes
 
     landmarks: list[Array | None] = []
     keys: dict[int, View] = {}

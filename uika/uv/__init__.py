@@ -1,9 +1,9 @@
 """Colours of photo pixels carried into the UV atlas: reprojection, aggregation over views, filling of unseen texels."""
 
-from uika.uv.aggregate import Aggregate, aggregate, pool
-from uika.uv.fill import diffuse, fill
+from uika.uv.aggregation import Aggregate, aggregate, pool
+from uika.uv.filling import diffuse, fill
 from uika.uv.holes import close_holes
-from uika.uv.reproject import Sums, accumulate, accumulate_sizes, reproject, view_images
+from uika.uv.reprojection import Sums, accumulate, accumulate_sizes, reproject, view_images
 
 __all__ = [
     "Aggregate",

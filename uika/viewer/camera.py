@@ -55,7 +55,7 @@ class CameraFace:
         self._thread.join(10)
 
     def _work(self) -> None:
-        from uika.photo.nets import follow_meshes
+        from uika.photo.networks import follow_meshes
 
         try:
             rate, before = 0.0, time.perf_counter()

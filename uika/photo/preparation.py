@@ -15,7 +15,7 @@ from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, 
 from uika.photo.detect import MIN_FACE, find_face
 from uika.photo.error import PhotoError
 from uika.photo.foreground import estimate_foreground
-from uika.photo.nets import person_mask
+from uika.photo.networks import person_mask
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from uika.uv.holes import close_holes
-from uika.uv.reproject import Grid, Sums, accumulate, mean_color
+from uika.uv.reprojection import Grid, Sums, accumulate, mean_color
 
 Normalization = Literal["minmax", "max"]
 
