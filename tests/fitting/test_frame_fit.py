@@ -8,19 +8,12 @@ import torch
 
 from tests.flame_files import flame_arrays
 from uika.fitting.bundle_adjustment import bundle
-from uika.fitting.frame_fit import (
-    FrameModel,
-    Pose,
-    fit_frame,
-    frame_model,
-    head_landmarks,
-    landmark_jacobian,
-    moved,
-)
+from uika.fitting.frame_fit import fit_frame
 from uika.fitting.landmarks import eye_distance
 from uika.fitting.photometric import SIDE, View, follow, learn, make_appearance, place_points
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array, axis_angle, rotation
+from uika.head.landmark_model import FrameModel, Pose, frame_model, head_landmarks, landmark_jacobian, moved
 from uika.head_import.flame_file import read_flame
 
 FOCAL = 1200.0

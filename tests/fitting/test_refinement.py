@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from uika.fitting import fit_landmarks
-from uika.fitting.frame_fit import FrameModel, Pose, frame_model, head_landmarks, moved, shifted
 from uika.fitting.landmark_prior import identity_modes, landmark_anchor, landmark_trust
 from uika.fitting.landmarks import eye_distance
 from uika.fitting.refinement import refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
 from uika.head.axis_angle import Array, rotation
 from uika.head.face_paint import paint, shade
+from uika.head.landmark_model import FrameModel, Pose, frame_model, head_landmarks, moved, shifted
 
 FOCAL = 1200.0
 SIZE = 256

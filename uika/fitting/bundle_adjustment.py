@@ -14,14 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.fitting.frame_fit import FrameModel, Pose, moved, shifted
+from uika.fitting.jacobians import level_jacobian
 from uika.fitting.landmark_prior import identity_modes, landmark_anchor
 from uika.fitting.photometric import (
     CORRELATED,
-    EXPRESSION_PRIOR,
     LIGHT_PRIOR,
-    NOISE,
-    ROBUST_SCALE,
     Appearance,
     View,
     along_surface,
@@ -29,8 +26,10 @@ from uika.fitting.photometric import (
     point_trust,
     sample,
 )
+from uika.fitting.weights import GREY_EXPRESSION_PRIOR, GREY_NOISE, GREY_ROBUST_SCALE
 from uika.head import HeadModel
 from uika.head.axis_angle import Array
+from uika.head.landmark_model import FrameModel, Pose, moved, shifted
 
 MODES = 60  # of the identity; finer ones do not show at video resolution
 IDENTITY_PULL = 3.0  # per squared standard deviation away from the landmarks' identity
@@ -119,7 +118,7 @@ def _rows(
         place, camera = place_points(current, pose, view)
         values = sample(view, place)
         slope = values[:, 1:] * (view.scale * state.focal) / camera[:, 2:]
-        d_camera = np.concatenate((slope, -(slope * camera[:, :2]).sum(-1, keepdims=True) / camera[:, 2:]), -1)
+        d_camera = level_jacobian(slope, camera)
         d_head = (d_camera @ pose.rotation).astype(np.float32)
         mine = np.empty((len(camera), len(model.free) + 3 * len(model.joints) + 6), dtype=np.float32)
         along_surface(current, pose, d_head, mine[:, :-6])
@@ -129,7 +128,7 @@ def _rows(
         common[:, :-1] = (d_head.T[:, :, None] * modes).sum(0)
         common[:, -1] = (slope * camera[:, :2]).sum(-1)
         levels.append(values[:, 0])
-        weights.append(point_trust(current, pose, camera) / (CORRELATED * NOISE**2))
+        weights.append(point_trust(current, pose, camera) / (CORRELATED * GREY_NOISE**2))
         shared.append(common)
         own.append(mine)
         facing.append(np.concatenate((np.ones((len(camera), 1)), model.normal @ pose.rotation.T), -1))
@@ -137,7 +136,7 @@ def _rows(
     weight *= (weight > 0).sum(0) >= MIN_VIEWS
     gain, middle = np.ones_like(level), _common(level, weight)
     for _ in range(3):
-        robust = ROBUST_SCALE**2 / (ROBUST_SCALE**2 + (level / gain - middle) ** 2)
+        robust = GREY_ROBUST_SCALE**2 / (GREY_ROBUST_SCALE**2 + (level / gain - middle) ** 2)
         gain = _light(level, middle[0], weight * robust**2, np.stack(facing))
         middle = _common(level / gain, weight * robust**2)
     inverse = (1 / gain).astype(np.float32)[..., None]
@@ -167,11 +166,11 @@ def _cost(
     focal_spread: float,
 ) -> float:
     square = rows.residual**2
-    cost = float((rows.weight * square * ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)).sum())
+    cost = float((rows.weight * square * GREY_ROBUST_SCALE**2 / (GREY_ROBUST_SCALE**2 + square)).sum())
     cost += IDENTITY_PULL * float(state.offset @ state.offset) + (math.log(state.focal / start) / focal_spread) ** 2
     for k, pose in state.poses.items():
         far, (matrix, gradient) = travelled[k], anchors[k]
-        cost += EXPRESSION_PRIOR * float(pose.expression @ pose.expression)
+        cost += GREY_EXPRESSION_PRIOR * float(pose.expression @ pose.expression)
         cost += float(2 * gradient @ far + far @ matrix @ far)
     return cost
 
@@ -206,8 +205,8 @@ def _step(
         coupling[:, :K] += weighted[:, :K]
         coupling[:, at] = weighted[:, K:]
         diagonal = np.arange(at.start, at.start + E)
-        matrix[diagonal, diagonal] += EXPRESSION_PRIOR
-        gradient[diagonal] += EXPRESSION_PRIOR * state.poses[k].expression
+        matrix[diagonal, diagonal] += GREY_EXPRESSION_PRIOR
+        gradient[diagonal] += GREY_EXPRESSION_PRIOR * state.poses[k].expression
         every = np.r_[:K, at.start : at.stop]
         matrix[np.ix_(every, every)] += anchors[k][0]
         gradient[every] += anchors[k][1] + anchors[k][0] @ travelled[k]

@@ -7,18 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.fitting.frame_fit import (
-    FACING,
-    HIDDEN_TRUST,
-    NOISE,
-    ROBUST_SCALE,
-    FrameModel,
-    Pose,
-    head_landmarks,
-    landmark_jacobian,
-)
+from uika.fitting.jacobians import projection_jacobian
+from uika.fitting.weights import FRAME_ROBUST_SCALE, LANDMARK_FACING, LANDMARK_HIDDEN_TRUST, LANDMARK_NOISE
 from uika.head import HeadModel
 from uika.head.axis_angle import Array, cross
+from uika.head.landmark_model import FrameModel, Pose, head_landmarks, landmark_jacobian
 
 NEIGHBOURS = 4
 GROUP = 100.0  # landmarks that err as one when neighbours err alike
@@ -45,14 +38,11 @@ def landmark_anchor(model: FrameModel, modes: NDArray[np.float32], pose: Pose, t
     """
     residual, root, camera, scale = _residuals(model, pose, target)
     z = camera[:, 2]
-    f = model.focal * scale / z
-    d_camera = np.zeros((len(z), 2, 3))
-    d_camera[:, 0, 0] = d_camera[:, 1, 1] = f
-    d_camera[:, 0, 2], d_camera[:, 1, 2] = -f * camera[:, 0] / z, -f * camera[:, 1] / z
+    d_camera = projection_jacobian(camera, np.full(len(z), model.focal * scale))
     d_head = d_camera @ pose.rotation
     parts = (
         np.einsum("lij,jlk->lik", d_head, modes),
-        (f[:, None] * camera[:, :2])[..., None],
+        (model.focal * scale / z[:, None] * camera[:, :2])[..., None],
         d_head @ landmark_jacobian(model, pose),
         d_camera @ -cross(camera - pose.translation),
         d_camera,
@@ -76,7 +66,7 @@ def landmark_trust(model: FrameModel, poses: Mapping[int, Pose], targets: Mappin
         square += float(weight @ (residual**2).sum(-1))
         product += float(weight @ (residual * residual[near].mean(1)).sum(-1))
         total += float(weight.sum())
-    return 2 * NOISE**2 * total / square / (1 + GROUP * max(product / square, 0.0))
+    return 2 * LANDMARK_NOISE**2 * total / square / (1 + GROUP * max(product / square, 0.0))
 
 
 def _residuals(model: FrameModel, pose: Pose, target: Array) -> tuple[Array, Array, Array, float]:
@@ -85,6 +75,6 @@ def _residuals(model: FrameModel, pose: Pose, target: Array) -> tuple[Array, Arr
     scale = float(camera[:, 2].mean()) / (model.focal * model.unit)
     residual = (model.focal * camera[:, :2] / camera[:, 2:] - target[model.ids]) * scale
     cosine = -((model.normal @ pose.rotation.T) * camera).sum(-1) / np.linalg.norm(camera, axis=-1)
-    weight = model.weight * (cosine / FACING).clip(HIDDEN_TRUST, 1.0) ** 2
-    robust = (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + (residual**2).sum(-1))) ** 2
-    return residual, np.sqrt(weight * robust) / NOISE, camera, scale
+    weight = model.weight * (cosine / LANDMARK_FACING).clip(LANDMARK_HIDDEN_TRUST, 1.0) ** 2
+    robust = (FRAME_ROBUST_SCALE**2 / (FRAME_ROBUST_SCALE**2 + (residual**2).sum(-1))) ** 2
+    return residual, np.sqrt(weight * robust) / LANDMARK_NOISE, camera, scale

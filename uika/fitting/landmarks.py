@@ -12,34 +12,28 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from uika.fitting.jacobians import projection_jacobian
+from uika.fitting.weights import (
+    LANDMARK_EXPRESSION_PRIOR,
+    LANDMARK_FACING,
+    LANDMARK_HIDDEN_TRUST,
+    LANDMARK_NOISE,
+    PHOTO_ROBUST_SCALE,
+)
 from uika.head import HeadModel, vertex_normals
+from uika.head.landmark_model import CONTOUR_WEIGHT, EYELIDS, LIPS, UNFITTED
 
 MESH_POINTS = 478
 FIRST_IRIS = 468
 EYE_CORNERS = (33, 263)  # outer corners of the right and left eye
-# Contours of eyelids and lips: small errors there are the ones people see.
-EYELIDS = (
-    33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246,
-    263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466,
-)  # fmt: skip
-LIPS = (
-    61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185,
-    78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191,
-)  # fmt: skip
-CONTOUR_WEIGHT = 3.0
-UNFITTED = ("tongueOut",)  # no landmark sees the tongue
 
-NOISE = 0.02  # expected landmark error, in outer eye-corner distances
-ROBUST_SCALE = 0.04  # errors beyond this many eye-corner distances lose influence (Geman-McClure)
 IDENTITY_PRIOR = (3.0, 1.2)  # weights of |identity|^2 in the two rounds
-EXPRESSION_PRIOR = 2.0
 BOUND_WEIGHT = 60.0  # soft walls at activations 0 and 1
 DISTANCE, DISTANCE_SPREAD = 1.1, 0.35  # metres and log-spread: focal length and distance trade off on one photo
 LENS_SPREAD = 0.05  # log-spread of focal lengths that cameras note
 STEPS = (12, 18)
 MAX_DAMPING = 1e9
 TURN_POWER = 3  # of the cosine of a face's turn, by which photos count
-HIDDEN, FACING, HIDDEN_TRUST = 0.0, 0.6, 0.1  # cosines of the viewing angle between which a landmark gains trust
 
 
 @dataclass(frozen=True)
@@ -172,16 +166,16 @@ def _facing(problem: _Problem, state: LandmarkFit) -> Tensor:
     cosine = -(problem.normal @ state.rotation.mT * normalize(camera, dim=-1)).sum(-1)
     frontal = state.rotation[:, 2, 2].abs()
     photo = (frontal / frontal.max()) ** TURN_POWER
-    return ((cosine - HIDDEN) / (FACING - HIDDEN)).clamp(HIDDEN_TRUST, 1.0).square() * photo[:, None]
+    return (cosine / LANDMARK_FACING).clamp(LANDMARK_HIDDEN_TRUST, 1.0).square() * photo[:, None]
 
 
 def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
     pixels, camera = _project(problem, state)
     square = ((pixels - problem.target) / problem.pixel_unit[:, None, None]).square().sum(-1)
-    robust = ROBUST_SCALE**2 * square / (ROBUST_SCALE**2 + square) / NOISE**2
+    robust = PHOTO_ROBUST_SCALE**2 * square / (PHOTO_ROBUST_SCALE**2 + square) / LANDMARK_NOISE**2
     outside = state.expression - state.expression.clamp(0, 1)
     cost = (problem.weight * robust).sum() + problem.identity_prior * state.identity.square().sum()
-    cost = cost + EXPRESSION_PRIOR * state.expression.square().sum() + BOUND_WEIGHT * outside.square().sum()
+    cost = cost + LANDMARK_EXPRESSION_PRIOR * state.expression.square().sum() + BOUND_WEIGHT * outside.square().sum()
     near = (state.translation[:, 2].clamp(min=1e-3) / DISTANCE).log() / DISTANCE_SPREAD
     wide = (state.focal / problem.lens).log() / LENS_SPREAD
     cost = cost + torch.where(problem.lens.isnan(), near, wide).square().sum()
@@ -211,18 +205,15 @@ def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Te
     N, L = pixels.shape[:2]
     E = state.expression.shape[1]
     residual = (pixels - problem.target) / problem.pixel_unit[:, None, None]
-    robust = (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + residual.square().sum(-1))).square()
-    root = (problem.weight * robust).sqrt()[..., None] / NOISE
-    z = camera[..., 2]
-    zero = torch.zeros_like(z)
-    f = state.focal[:, None] / problem.pixel_unit[:, None] / z
-    x, y = camera[..., 0] / z, camera[..., 1] / z
-    d_camera = torch.stack((torch.stack((f, zero, -f * x), -1), torch.stack((zero, f, -f * y), -1)), -2)
+    robust = (PHOTO_ROBUST_SCALE**2 / (PHOTO_ROBUST_SCALE**2 + residual.square().sum(-1))).square()
+    root = (problem.weight * robust).sqrt()[..., None] / LANDMARK_NOISE
+    focal = state.focal[:, None] / problem.pixel_unit[:, None]
+    d_camera = torch.from_numpy(projection_jacobian(camera.numpy(), focal.numpy()))
     d_head = d_camera @ state.rotation[:, None]
     j_shape = torch.einsum("nlij,klj->nlik", d_head, problem.identity) * problem.shape_rows[:, None, None]
     j_expression = torch.einsum("nlij,elj->nlie", d_head, problem.expression) * problem.free
     turned = camera - state.translation[:, None]
-    cross = torch.zeros(N, L, 3, 3, dtype=z.dtype)
+    cross = torch.zeros(N, L, 3, 3, dtype=camera.dtype)
     cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = turned[..., 2], -turned[..., 1], turned[..., 0]
     cross = cross - cross.mT
     d_focal = (pixels / problem.pixel_unit[:, None, None])[..., None]
@@ -238,9 +229,9 @@ def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Te
     A.diagonal().add_(problem.identity_prior)
     a = a + problem.identity_prior * state.identity
     outside = state.expression - state.expression.clamp(0, 1)
-    curvature = EXPRESSION_PRIOR + BOUND_WEIGHT * (outside != 0).double()
+    curvature = LANDMARK_EXPRESSION_PRIOR + BOUND_WEIGHT * (outside != 0).double()
     C.diagonal(dim1=-2, dim2=-1)[:, :E].add_(curvature)
-    c[:, :E] += EXPRESSION_PRIOR * state.expression + BOUND_WEIGHT * outside
+    c[:, :E] += LANDMARK_EXPRESSION_PRIOR * state.expression + BOUND_WEIGHT * outside
     depth, noted = state.translation[:, 2], ~problem.lens.isnan()
     slope = ~noted / (DISTANCE_SPREAD * depth)
     C[:, E + 5, E + 5] += slope.square()

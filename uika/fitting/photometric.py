@@ -14,7 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from uika.fitting.frame_fit import (
+from uika.fitting.jacobians import level_jacobian
+from uika.fitting.weights import GREY_EXPRESSION_PRIOR, GREY_NOISE, GREY_ROBUST_SCALE, POINT_FACING, POINT_VISIBLE
+from uika.head import HeadModel, look_at, project, rasterize, uv_texels
+from uika.head.axis_angle import Array
+from uika.head.landmark_model import (
     FrameModel,
     Pose,
     bounded_step,
@@ -23,18 +27,12 @@ from uika.fitting.frame_fit import (
     moved,
     surface_model,
 )
-from uika.head import HeadModel, look_at, project, rasterize, uv_texels
-from uika.head.axis_angle import Array
 
 SIDE = 224  # pixels of the face crop that is compared
 FRONT_SIZE = 640  # pixels, of the pictures that tell which points are visible
 ATLAS = 80  # texels along a side; about 900 of them lie on the face
 MARGIN = 1.3  # side of the crop over the landmarks' box
-VISIBLE, FACING = 0.2, 0.7  # cosines of the viewing angle between which a point gains trust
-NOISE = 0.03  # expected error of a grey level in [0,1]
-ROBUST_SCALE = 0.08  # grey levels
 CORRELATED = 3.0  # neighbouring points err together: that many count as one
-EXPRESSION_PRIOR = 5.0
 LIGHT_PRIOR = (100.0, 100.0, 100.0, 100.0)  # per squared change of gain and of its slopes over the normal
 STILLNESS = 1.0
 SYMMETRY = 10.0  # faces mostly move alike on both sides
@@ -178,7 +176,7 @@ def place_points(model: FrameModel, pose: Pose, view: View) -> tuple[Array, Arra
 def point_trust(model: FrameModel, pose: Pose, camera: Array) -> Array:
     """Trust [M] in [0,1] by viewing angle."""
     cosine = -((model.normal @ pose.rotation.T) * camera).sum(-1) / np.linalg.norm(camera, axis=-1)
-    return ((cosine - VISIBLE) / (FACING - VISIBLE)).clip(0, 1)
+    return ((cosine - POINT_VISIBLE) / (POINT_FACING - POINT_VISIBLE)).clip(0, 1)
 
 
 def sample(view: View, place: Array) -> Array:
@@ -210,11 +208,10 @@ def _system(
     lit = appearance.level[:, None] * direction
     residual = values[:, 0] - lit @ light
     square = residual**2
-    robust = ROBUST_SCALE**2 / (ROBUST_SCALE**2 + square)
-    root = np.sqrt(weight / CORRELATED) * robust / NOISE
+    robust = GREY_ROBUST_SCALE**2 / (GREY_ROBUST_SCALE**2 + square)
+    root = np.sqrt(weight / CORRELATED) * robust / GREY_NOISE
     slope = values[:, 1:] * (view.scale * model.focal) / camera[:, 2:]
-    d_camera = np.concatenate((slope, -(slope * camera[:, :2]).sum(-1, keepdims=True) / camera[:, 2:]), -1)
-    d_camera *= root[:, None]
+    d_camera = level_jacobian(slope, camera) * root[:, None]
     E, P = len(pose.expression), len(travelled)
     # Single precision halves the time of the one large product; what it loses is far below the noise.
     jacobian = np.empty((len(camera), P + 4), dtype=np.float32)
@@ -226,17 +223,17 @@ def _system(
     gradient = (jacobian.T @ (root * residual).astype(np.float32)).astype(np.float64)
     pull, change = pose.expression, pose.expression - before.expression
     index, uneven = np.arange(E), pull - pull[model.twin]
-    matrix[index, index] += EXPRESSION_PRIOR + STILLNESS + SYMMETRY
+    matrix[index, index] += GREY_EXPRESSION_PRIOR + STILLNESS + SYMMETRY
     matrix[index, model.twin] -= SYMMETRY
-    gradient[:E] += EXPRESSION_PRIOR * pull + STILLNESS * change + SYMMETRY * uneven
+    gradient[:E] += GREY_EXPRESSION_PRIOR * pull + STILLNESS * change + SYMMETRY * uneven
     swing = light - (1.0, 0.0, 0.0, 0.0)
     matrix[range(P, P + 4), range(P, P + 4)] += LIGHT_PRIOR
     gradient[P:] += LIGHT_PRIOR * swing
     matrix[:P, :P] += anchor[0]
     gradient[:P] += anchor[1] + anchor[0] @ travelled
-    cost = float(weight @ (square * robust)) / (CORRELATED * NOISE**2) + float(np.array(LIGHT_PRIOR) @ swing**2)
+    cost = float(weight @ (square * robust)) / (CORRELATED * GREY_NOISE**2) + float(np.array(LIGHT_PRIOR) @ swing**2)
     cost += (
-        EXPRESSION_PRIOR * float(pull @ pull)
+        GREY_EXPRESSION_PRIOR * float(pull @ pull)
         + SYMMETRY / 2 * float(uneven @ uneven)
         + STILLNESS * float(change @ change)
     )

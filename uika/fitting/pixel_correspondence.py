@@ -7,12 +7,12 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from uika.fitting.fit import Fit
+from uika.fitting.weights import PIXEL_FACING, PIXEL_GRAZING
 from uika.head import HeadModel, pose_vertices, project, rasterize, vertex_normals
 
 SURE_MATTE, FULL_MATTE = 0.7, 0.98  # matte values between which a pixel gains weight: edges carry background light
 EDGE = 2  # pixels inside the matte's edge that are not trusted
 LID_DOUBT = 0.8  # an open eye shows the lid in the shadow of its fold and lashes; shut, it is mostly skin
-GRAZING, FACING = 0.08, 0.55  # cosines between which a pixel gains weight: grazing pixels smear over many texels
 
 
 def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -45,7 +45,7 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         surface = (vertices[n][corners] * mix[..., None]).sum(-2)
         cosine = (normal * normalize(camera.position - surface, dim=-1)).sum(-1)
         inner = -max_pool2d(-matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
-        trust = _ramp(inner, SURE_MATTE, FULL_MATTE) * _ramp(cosine, GRAZING, FACING)
+        trust = _ramp(inner, SURE_MATTE, FULL_MATTE) * _ramp(cosine, PIXEL_GRAZING, PIXEL_FACING)
         if "eyes" in head.masks:
             trust = trust * (1 - LID_DOUBT * (head.masks["eyes"][corners] * mix).sum(-1))
         seen = hit & (trust > 0)

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from uika.fitting.bundle_adjustment import bundle
-from uika.fitting.frame_fit import Pose, frame_model, landmark_pull
+from uika.fitting.frame_fit import landmark_pull
 from uika.fitting.landmark_prior import landmark_trust
 from uika.fitting.landmarks import LandmarkFit, eye_distance
 from uika.fitting.photometric import View, face_view, follow, learn, make_appearance
 from uika.head import HeadModel
 from uika.head.axis_angle import Array
+from uika.head.landmark_model import Pose, frame_model
 
 BLUR = 0.8  # pixels of the face crop
 FOLLOW_STEPS = 6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,28 +20,31 @@ SPEED_GAIN = {  # how much faster things may pass, hertz per unit and second
     "eyes": 20.0,
     "translation": 60.0,
 }
+_Number = TypeVar("_Number", float, Tensor)
 _SPEED_CUTOFF = 1.0  # hertz, of the speed estimate
 
 
-def one_euro(values: Tensor, fps: float, min_cutoff: float, gain: float) -> Tensor:
-    """The 1-euro filter (Casiez et al., CHI 2012): a low pass whose cutoff rises with the speed of the signal.
+class OneEuro:
+    """The 1-euro filter (Casiez et al., CHI 2012): a low pass whose cutoff rises with the speed of the signal."""
 
-    Args:
-        values: [T,...] samples.
-        fps: samples per second.
-        min_cutoff: hertz at rest.
-        gain: hertz per unit and second of speed.
-    """
-    result = torch.empty_like(values)
-    result[0] = kept = values[0]
-    speed = torch.zeros_like(kept)
-    slow = _share(_SPEED_CUTOFF, fps)
-    for index in range(1, len(values)):
-        speed = speed + slow * ((values[index] - kept) * fps - speed)
-        cutoff = min_cutoff + gain * speed.abs()
-        kept = kept + (1 / (1 + fps / (2 * math.pi * cutoff))) * (values[index] - kept)
-        result[index] = kept
-    return result
+    def __init__(self, value: Tensor, min_cutoff: float, gain: float) -> None:
+        """Start at a value [...]; `min_cutoff` in hertz at rest, `gain` in hertz per unit and second of speed."""
+        self._kept, self._speed = value, torch.zeros_like(value)
+        self._min_cutoff, self._gain = min_cutoff, gain
+
+    def step(self, value: Tensor, seconds: float) -> Tensor:
+        """The smoothed value [...], `seconds` after the one before."""
+        change = (value - self._kept) / seconds
+        self._speed = self._speed + _share(_SPEED_CUTOFF, seconds) * (change - self._speed)
+        cutoff = self._min_cutoff + self._gain * self._speed.abs()
+        self._kept = self._kept + _share(cutoff, seconds) * (value - self._kept)
+        return self._kept
+
+
+def one_euro(values: Tensor, fps: float, min_cutoff: float, gain: float) -> Tensor:
+    """Samples [T,...] at `fps` per second through a `OneEuro`, forwards."""
+    smooth = OneEuro(values[0], min_cutoff, gain)
+    return torch.stack([values[0], *(smooth.step(value, 1 / fps) for value in values[1:])])
 
 
 def smoothed(motion: Motion, min_cutoff: float = MIN_CUTOFF) -> Motion:
@@ -67,5 +70,5 @@ def smoothed(motion: Motion, min_cutoff: float = MIN_CUTOFF) -> Motion:
     return replace(motion, **changed)
 
 
-def _share(cutoff: float, fps: float) -> float:
-    return 1 / (1 + fps / (2 * math.pi * cutoff))
+def _share(cutoff: _Number, seconds: float) -> _Number:
+    return 1 / (1 + 1 / (2 * math.pi * cutoff * seconds))

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uika.fitting.frame_fit import FrameModel, Pose, landmark_pull
+from uika.fitting.frame_fit import landmark_pull
 from uika.fitting.photometric import Appearance, View, face_view, follow, learn
 from uika.head.axis_angle import Array
+from uika.head.landmark_model import FrameModel, Pose
 
 BLURS = ((2.5, 3), (0.8, 3))  # pixels of the face crop, and steps at that blur
 LANDMARK_PULL = 0.01  # landmarks only keep the colours from getting lost: their errors are systematic

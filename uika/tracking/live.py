@@ -6,17 +6,16 @@ import math
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from uika.fitting.frame_fit import FrameModel, Pose, fit_frame, frame_model, start_pose
+from uika.fitting.frame_fit import fit_frame, start_pose
 from uika.fitting.landmarks import eye_distance, fit_landmarks
 from uika.head import HeadModel, HeadParameters
 from uika.head.axis_angle import Array
-from uika.motion.smoothing import MIN_CUTOFF, SPEED_GAIN
+from uika.head.landmark_model import FrameModel, Pose, frame_model
+from uika.motion.smoothing import MIN_CUTOFF, SPEED_GAIN, OneEuro
 from uika.tracking.poses import poses_to_motion
 
 LEARNING_FRAMES = 8  # with a face: the person's shape and the focal length come from these
-_SPEED_CUTOFF = 1.0  # hertz
 _LONGEST_STEP = 0.5  # seconds: after a longer pause there is nothing left to smooth
 
 
@@ -31,7 +30,7 @@ class FaceFollower:
         self._identity = torch.zeros(len(head.identity_basis))
         self._pose: Pose | None = None
         self._start: Pose | None = None
-        self._smooth: dict[str, _Smooth] = {}
+        self._smooth: dict[str, OneEuro] = {}
         self._last = -math.inf
 
     @property
@@ -62,7 +61,7 @@ class FaceFollower:
         values = {name: value[1] for name, value in pair.tensors().items()}
         values["translation"] = pair.translation[1] - pair.translation[0]
         if step > _LONGEST_STEP:
-            self._smooth = {name: _Smooth(value, SPEED_GAIN[name]) for name, value in values.items()}
+            self._smooth = {name: OneEuro(value, MIN_CUTOFF, SPEED_GAIN[name]) for name, value in values.items()}
         calm = {name: self._smooth[name].step(value, max(step, 1e-3)) for name, value in values.items()}
         return HeadParameters.zeros(self._head).replace(**calm)
 
@@ -73,22 +72,3 @@ class FaceFollower:
         last = start_pose(self._model, fit, len(self._taught) - 1)
         self._pose = fit_frame(self._model, self._taught[-1], last, stillness=0.0)[0]
         self._taught = []
-
-
-class _Smooth:
-    """The 1-euro filter of one quantity (see `uika.motion.smoothing`), forwards only, for steps of any length."""
-
-    def __init__(self, value: Tensor, gain: float) -> None:
-        self._kept, self._speed, self._gain = value, torch.zeros_like(value), gain
-
-    def step(self, value: Tensor, seconds: float) -> Tensor:
-        """The smoothed value, `seconds` after the one before."""
-        change = (value - self._kept) / seconds
-        self._speed = self._speed + _share(torch.tensor(_SPEED_CUTOFF), seconds) * (change - self._speed)
-        cutoff = MIN_CUTOFF + self._gain * self._speed.abs()
-        self._kept = self._kept + _share(cutoff, seconds) * (value - self._kept)
-        return self._kept
-
-
-def _share(cutoff: Tensor, seconds: float) -> Tensor:
-    return 1 / (1 + 1 / (2 * math.pi * cutoff * seconds))

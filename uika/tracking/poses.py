@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.fitting.frame_fit import FrameModel, Pose
 from uika.head import HeadModel
 from uika.head.axis_angle import Array, axis_angle, rotation
+from uika.head.landmark_model import FrameModel, Pose
 from uika.motion import Motion
 
 

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from uika.fitting.frame_fit import Pose
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, project
 from uika.head.face_paint import paint, shade
+from uika.head.landmark_model import Pose
 from uika.io.progress import counted
 from uika.io.video import write_video
 from uika.tracking.decode import video_frames

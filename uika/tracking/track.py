@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.fitting.bundle_adjustment import bundle
-from uika.fitting.frame_fit import FrameModel, Pose, fit_frame, frame_model, start_pose
+from uika.fitting.frame_fit import fit_frame, start_pose
 from uika.fitting.landmarks import LandmarkFit, eye_distance, fit_landmarks
 from uika.fitting.photometric import View, face_view, learn, make_appearance
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array
+from uika.head.landmark_model import FrameModel, Pose, frame_model
 from uika.io.progress import counted
 from uika.motion import Motion
 from uika.motion.smoothing import smoothed
