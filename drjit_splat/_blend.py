@@ -23,7 +23,7 @@ from ._backend import (
     smaller,
     write,
 )
-from ._lists import TileLists
+from ._binning import TileLists
 from ._project import RECORD
 from ._settings import Settings
 

@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 
 from ._backend import RECORDINGS, TILE, Backend, add_packet, packet, power_of_two, recorded
+from ._binning import TileLists, lane_order
 from ._blend import (
     Blended,
     clamped_alpha,
@@ -20,7 +21,6 @@ from ._blend import (
     tile_of,
     uses_recurrence,
 )
-from ._lists import TileLists, lane_order
 from ._project import RECORD
 from ._settings import Settings
 

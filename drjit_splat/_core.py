@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from . import _adjoint, _lists, _project
+from . import _binning, _project, _project_backward
 from . import constants as c
 from ._backend import Backend, larger, packet, power_of_two, write, write_packet
 from ._blend import Blended, blend
@@ -36,7 +36,7 @@ class Trace:
     be: Backend
     settings: Settings
     projected: _project.Projected | None = None
-    lists: _lists.TileLists | None = None
+    lists: _binning.TileLists | None = None
     chunks: list[Chunk] = field(default_factory=list)
 
     def skipped(self) -> dict[str, int]:
@@ -67,7 +67,7 @@ def geometry(be: Backend, arrays: Arrays, settings: Settings, features: int) -> 
     with stage("project"):
         trace.projected = queue(be, arrays, settings, features).result()
     if trace.projected.pairs and not trace.projected.nonfinite:
-        trace.lists = _lists.build(be, trace.projected, settings)
+        trace.lists = _binning.build(be, trace.projected, settings)
     return trace
 
 
@@ -125,7 +125,7 @@ class Wanted:
 class Gradients:
     """Flat Dr.Jit arrays, None where nothing was asked for."""
 
-    inputs: _adjoint.InputGradients
+    inputs: _project_backward.InputGradients
     colors: Any | None  # [N * D]
 
 
@@ -179,10 +179,10 @@ def backward(
     with stage("projection backward"):
         if wanted.shape or wanted.camera:
             camera = _project.read_camera(be, arrays, trace.settings)
-            inputs = _adjoint.projection_adjoint(
+            inputs = _project_backward.projection_adjoint(
                 be, arrays, p.records, p.visible, sums, grad_depth, camera, trace.settings, wanted.camera
             )
         else:
-            inputs = _adjoint.opacity_adjoint(be, arrays.opacities, p.visible, sums, wanted.opacities)
+            inputs = _project_backward.opacity_adjoint(be, arrays.opacities, p.visible, sums, wanted.opacities)
         dr.eval(grad_colors)
     return Gradients(inputs, grad_colors)

@@ -11,7 +11,6 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import Backend, larger, smaller
-from ._footprint import LOG2E
 from ._settings import Settings
 
 
@@ -62,7 +61,7 @@ class Ellipse:
         A sum of squares, unlike the expanded quadratic, cannot turn negative by rounding far along a needle.
         """
         log_opacity = dr.log2(larger(self.opacity, c.OPACITY_FLOOR))
-        half = 0.5 * LOG2E
+        half = 0.5 * c.LOG2E
         return [self.x, self.y, self.sharpness, self.lean, half / self.yy, log_opacity]
 
 
@@ -133,7 +132,7 @@ def _sheared(spread: Spread, yy: Any, determinant: Any, eps2d: Any) -> tuple[Any
     quotients' own derivatives are differences of terms that grow with the splat and all but cancel, over yy^2, which
     leaves the range of float32.
     """
-    value, h = 0.5 * LOG2E * yy / determinant, -spread.xy / yy
+    value, h = 0.5 * c.LOG2E * yy / determinant, -spread.xy / yy
     if not spread.a or not dr.is_diff_v(value):
         return value, h
     a, b, minors, plain_yy, slope = (dr.detach(v, True) for v in (spread.a, spread.b, spread.minors, yy, h))

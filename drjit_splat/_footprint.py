@@ -5,18 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
 from . import constants as c
 from ._backend import TILE, Backend, larger, smaller
+from ._ewa import Camera, Ellipse
 from ._settings import Settings
-
-if TYPE_CHECKING:
-    from ._ewa import Camera, Ellipse
-
-LOG2E = math.log2(math.e)
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ class Footprint:
 def footprint(ellipse: Ellipse, log_opacity: Any, cam: Camera, settings: Settings) -> Footprint:
     """Footprint of a projected splat of an opacity 2**`log_opacity` above the threshold."""
     e = ellipse
-    threshold = (2 / LOG2E) * larger(log_opacity + (c.CUT_SLACK - math.log2(settings.options.alpha_min)), 0.0)
+    threshold = (2 / c.LOG2E) * larger(log_opacity + (c.CUT_SLACK - math.log2(settings.options.alpha_min)), 0.0)
     reach = dr.sqrt(threshold * e.yy)
     first = larger(dr.ceil(e.y - reach - 0.5), 0.0)
     last = smaller(dr.floor(e.y + reach - 0.5), cam.height - 1.0)

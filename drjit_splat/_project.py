@@ -8,9 +8,10 @@ from typing import Any
 
 import drjit as dr
 
+from . import constants as c
 from ._backend import Backend, bits_of, larger, packet, power_of_two, write, write_packet
 from ._ewa import Camera, Shape, exact_centre, project
-from ._footprint import LOG2E, count_tiles, footprint, square_limits, square_radius
+from ._footprint import count_tiles, footprint, square_limits, square_radius
 from ._settings import Settings
 
 RECORD = 16  # floats a splat: 8 of geometry (see Ellipse.geometry, with x and y relative to the middle of the image;
@@ -126,7 +127,7 @@ def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Ca
     log_reach = geometry[5] if options.opacity_extent else larger(geometry[5], 0.0)
     foot = footprint(e, log_reach, cam, settings)
     bright = (e.opacity >= options.alpha_min) if options.opacity_extent else J.Bool(True)
-    exact = (2 / LOG2E) * larger(log_reach - math.log2(options.alpha_min), 0.0)
+    exact = (2 / c.LOG2E) * larger(log_reach - math.log2(options.alpha_min), 0.0)
     extent_x, extent_y = dr.sqrt(exact * e.xx), dr.sqrt(exact * e.yy)
     on_screen = (e.x + extent_x > 0.5) & (e.x - extent_x < cam.width - 0.5)
     on_screen &= (e.y + extent_y > 0.5) & (e.y - extent_y < cam.height - 0.5)

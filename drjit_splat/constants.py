@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
+LOG2E = math.log2(math.e)
+"""Exponents count in powers of two: exp(x) = 2 ** (LOG2E x)."""
+
 ALPHA_MIN = 1.0 / 255.0
 """A (pixel, splat) pair below one 8-bit step is skipped; it also bounds each splat's footprint."""
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
+from ._autograd import INPUTS, arrays_of, image_of, split
 from ._backend import Backend, backend_of, exclusive, flat
-from ._function import INPUTS, arrays_of, image_of, split
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
 from ._meta import Meta, describe, stack

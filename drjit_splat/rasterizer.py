@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._autograd import Splat
 from ._backend import exclusive
 from ._compat import check_compatibility
 from ._core import Trace
-from ._function import Splat
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
 from ._meta import Meta, describe, stack

@@ -20,7 +20,7 @@ from uika.io.progress import counted
 from uika.motion import Motion
 
 if TYPE_CHECKING:
-    from drjit_splat.pictures import Exposure, Picture
+    from drjit_splat.frames import Exposure, Picture
 
 _BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
 
@@ -66,7 +66,7 @@ class FrameRenderer:
             turn: [4] its rigid turn.
             camera: one camera.
         """
-        from drjit_splat.pictures import expose
+        from drjit_splat.frames import expose
 
         posed = self.rig.pose(vertices, turn)
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)

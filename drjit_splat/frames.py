@@ -11,10 +11,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _core, _lists
+from . import _core
 from ._backend import RECORDINGS, TILE, Backend, backend_named, exclusive, larger, recorded, smaller, write
+from ._binning import TileLists, build, empty
 from ._blend import accumulate
-from ._lists import TileLists
 from ._project import Arrays, Queued
 from ._settings import Options, Settings
 from .profiling import stage
@@ -66,7 +66,7 @@ class Exposure:
         if projected.nonfinite:
             raise ValueError("every value of the splats and the camera must be finite in float32")
         work = None if like is None else like.work
-        lists = _lists.build(be, projected, self.settings, work) if projected.pairs else _lists.empty(be, self.settings)
+        lists = build(be, projected, self.settings, work) if projected.pairs else empty(be, self.settings)
         kernel = _printing(be, lists.columns, lists.rows, self.settings)
         with stage("blend"):
             words, work = kernel(projected.records, lists.ids, lists.start, lists.order, background)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from drjit_splat import rasterization, reference
-from drjit_splat.pictures import Picture, expose
+from drjit_splat.frames import Picture, expose
 from tests.drjit_splat.common import random_scene
 
 SIZE = (61, 47)
