@@ -84,7 +84,7 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
             found.setdefault("pose", []).append(1e3 * (time.perf_counter() - start))
             with profile() as report:
                 start = time.perf_counter()
-                picture = renderer.develop(renderer.expose(mesh, turn, view), picture)
+                picture = renderer.blend(renderer.project(mesh, turn, view), picture)
                 dr.sync_thread()
                 found.setdefault("frame", []).append(1e3 * (time.perf_counter() - start))
             for name, spent in report.stages.items():

@@ -24,9 +24,9 @@ from benchmarks.figures import bars
 from benchmarks.harness import interleaved, markdown, save
 from benchmarks.splat_scenes import NAMES, QUICK, Scene, named_scene
 from drjit_splat import rasterization
+from drjit_splat.constants import SH_C0
 from drjit_splat.llvm import require
 
-_C0 = 0.28209479177387814
 MARGIN = 1e-4
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -58,7 +58,7 @@ def mitsuba_scene(scene: Scene) -> Any:
                 "scales": mi.TensorXf(scales.numpy()),
                 "quaternions": mi.TensorXf(xyzw.numpy()),
                 "opacities": mi.TensorXf(opacities[:, None].numpy()),
-                "sh_coeffs": mi.TensorXf(((colors - 0.5) / _C0).numpy()),
+                "sh_coeffs": mi.TensorXf(((colors - 0.5) / SH_C0).numpy()),
                 "extent": 3.33,
             },
             "sensor": {
@@ -133,7 +133,7 @@ def mitsuba(scene: Scene, weight: Tensor) -> Peer:
             torch.from_numpy(dr.grad(parameters[key]).numpy().copy()).view(count, -1) for key in keys
         )
         means, scales, xyzw = data.split((3, 3, 4), 1)
-        return means, xyzw[:, [3, 0, 1, 2]], scales, opacities[:, 0], harmonics / _C0
+        return means, xyzw[:, [3, 0, 1, 2]], scales, opacities[:, 0], harmonics / SH_C0
 
     return Peer(forward, both)
 

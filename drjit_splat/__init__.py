@@ -8,29 +8,36 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from . import reference
     from ._settings import Options
+    from .frames import Frame, ProjectedFrame, project_frame
     from .ply import SplatFile, load_ply, save_ply
     from .prepared import Prepared, prepare
     from .profiling import profile
     from .rasterizer import rasterization
 
 _HOMES = {
+    "Frame": "frames",
     "Options": "_settings",
     "Prepared": "prepared",
+    "ProjectedFrame": "frames",
     "SplatFile": "ply",
     "load_ply": "ply",
     "prepare": "prepared",
     "profile": "profiling",
+    "project_frame": "frames",
     "rasterization": "rasterizer",
     "save_ply": "ply",
 }
 
 __all__ = [
+    "Frame",
     "Options",
     "Prepared",
+    "ProjectedFrame",
     "SplatFile",
     "load_ply",
     "prepare",
     "profile",
+    "project_frame",
     "rasterization",
     "reference",
     "save_ply",

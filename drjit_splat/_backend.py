@@ -89,12 +89,12 @@ def backend_of(device: torch.device) -> Backend:
 
 
 def smaller(a: Any, b: Any) -> Any:
-    """Lane-wise minimum by selection: LLVM 15 crashes on the vector intrinsic behind `dr.minimum`."""
+    """Lane-wise minimum; `b` where `a` is NaN, which ends there (`dr.minimum` would pass it on)."""
     return dr.select(a < b, a, b)
 
 
 def larger(a: Any, b: Any) -> Any:
-    """Lane-wise maximum by selection, see `smaller`."""
+    """Lane-wise maximum; `b` where `a` is NaN, see `smaller`."""
     return dr.select(a > b, a, b)
 
 

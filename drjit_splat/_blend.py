@@ -208,15 +208,24 @@ def accumulate(
     sums = features + int(settings.expected_depth)
     tile = tile_of(be, lists.order, lists, settings)
 
+    # Loop variables, one of each a lane:
+    #   k       place in the list of the first of the UNROLL entries of this turn
+    #   splats  [UNROLL] those entries: indices of records, read a turn ahead
+    #   state   [16][1 + sums] for each pixel its transmittance (negative once it has stopped), the sums of the features
+    #           and, where a depth is divided by it, the coverage
+
     def body(k: Any, splats: list[Any], state: list[list[Any]]) -> tuple[Any, list[Any], list[list[Any]]]:
         state = [list(pixel) for pixel in state]
         ramps, values = [], []
+        # -------------------- Entries of the next turn --------------------
         following = entries(be, lists, k + UNROLL, tile.last, UNROLL)
+        # -------------------- Records and the start of each recurrence --------------------
         for j, splat in enumerate(splats):
             active = k + j < tile.last
             geometry = packet(be, records, 2 * splat, 8, active)
             values.append(read_features(be, records, splat, features, active))
             ramps.append(raw_alphas(be, geometry, *offsets(be, tile, geometry), settings, active))
+        # -------------------- Composite, pixel by pixel, near to far --------------------
         for pixel, raws in zip(state, zip(*ramps, strict=True), strict=True):
             for raw, value in zip(raws, values, strict=True):
                 _, weight, pixel[0] = step(be, clamped_alpha(raw, settings), pixel[0], settings)
@@ -230,11 +239,13 @@ def accumulate(
         left = k < tile.last
         return left & ~all_done(be, [pixel[0] for pixel in state]) if settings.options.stop_early else left
 
+    # -------------------- Initial state: pixels outside the image have stopped --------------------
     # A pixel's transmittance and sums stay next to each other: the compiled order follows that of the state.
     start = [
         [dr.select(inside, J.Float(1.0), J.Float(-1.0)), *(J.Float(0) for _ in range(sums))]
         for _, inside in tile.pixels()
     ]
+    # -------------------- Loop over the list --------------------
     # The splats of a turn are read a turn ahead: their records are gathers at addresses that wait for them.
     k, _, state = dr.while_loop(
         (tile.first, entries(be, lists, tile.first, tile.last, UNROLL), start),

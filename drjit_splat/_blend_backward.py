@@ -90,9 +90,9 @@ def _add_gradients(
     tile = tile_of(be, lists.order, lists, settings)
     stop = dr.gather(J.UInt32, blended.end, tile.index, tile.used)
     padded = power_of_two(features)
-
     ratio = RECORD // padded
 
+    # -------------------- Read the image and its gradient --------------------
     image_gradients, behind, start = [], [], []
     for index, inside in tile.pixels():
         g = [dr.gather(J.Float, grad_features, index * features + f, inside) for f in range(features)]
@@ -106,13 +106,20 @@ def _add_gradients(
         behind.append(rest)
         start.append(dr.select(inside, J.Float(1.0), J.Float(-1.0)))
 
+    # Loop variables, one of each a lane:
+    #   k               place in the list of the first of the UNROLL entries of this turn
+    #   transmittances  [16] in front of the entry, as in the forward pass (negative once the pixel has stopped)
+    #   behind          [16] gradient-weighted sum of what lies behind the entries passed so far
+
     def body(k: Any, transmittances: list[Any], behind: list[Any]) -> tuple[Any, list[Any], list[Any]]:
         transmittances, behind = list(transmittances), list(behind)
         for j, splat in enumerate(entries(be, lists, k, stop, UNROLL)):
+            # -------------------- Record --------------------
             active = k + j < stop
             geometry = packet(be, records, 2 * splat, 8, active)
             values = read_features(be, records, splat, features, active)
             s, t = offsets(be, tile, geometry)
+            # -------------------- Replay each pixel and take its derivative by alpha --------------------
             by_value = [J.Float(0) for _ in range(features)]
             total = J.Float(0)
             slopes = []
@@ -129,6 +136,7 @@ def _add_gradients(
                 slope = dr.fma(-behind[p], alpha / (1.0 - alpha), shade)
                 slopes.append(dr.select(alive & (raw < settings.alpha_max), slope, 0.0))
                 total += weight
+            # -------------------- Reduce over the tile and add to the splat's gradient --------------------
             blended_here = total > 0.0
             moments = _moments if uses_recurrence(settings) else _moments_pixel_by_pixel
             add_packet(be, gradients, moments(J, slopes, geometry[3], s, t), 2 * splat, blended_here)
@@ -136,6 +144,7 @@ def _add_gradients(
             add_packet(be, gradients, by_value + padding, ratio * splat + ratio // 2, blended_here)
         return k + UNROLL, transmittances, behind
 
+    # -------------------- Loop up to the last entry that the forward pass looked at --------------------
     dr.while_loop((tile.first, start, behind), lambda k, t, r: k < stop, body, mode="symbolic")
 
 

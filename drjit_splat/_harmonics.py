@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from .constants import SH_C0
+
 if TYPE_CHECKING:
     from torch import Tensor
 
-C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
@@ -18,7 +19,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     import torch
 
     x, y, z = directions.unbind(-1)
-    terms = [torch.full_like(x, C0)]
+    terms = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         terms += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

@@ -6,12 +6,13 @@ from typing import Any
 
 import drjit as dr
 
-from ._harmonics import C0, C1, C2, C3
+from ._harmonics import C1, C2, C3
+from .constants import SH_C0
 
 
 def basis(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
     """The (degree + 1)^2 harmonics in the unit direction x, y, z; degree 0 to 3."""
-    terms = [C0 + 0 * x]
+    terms = [SH_C0 + 0 * x]
     if degree >= 1:
         terms += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

@@ -7,6 +7,9 @@ import math
 LOG2E = math.log2(math.e)
 """Exponents count in powers of two: exp(x) = 2 ** (LOG2E x)."""
 
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / sqrt(4 pi): a colour is 0.5 + SH_C0 times its first coefficient."""
+
 ALPHA_MIN = 1.0 / 255.0
 """A (pixel, splat) pair below one 8-bit step is skipped; it also bounds each splat's footprint."""
 

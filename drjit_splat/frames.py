@@ -25,8 +25,8 @@ WORDS = TILE * CHANNELS // 4  # 32-bit words that hold the bytes of a tile's row
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture that may still be in the making."""
+class Frame:
+    """An image of bytes whose kernel may still run."""
 
     words: Any  # whole tiles, row by row, each pixel's three bytes after those of its left neighbour
     work: Any  # [tiles] list entries that each tile took
@@ -42,19 +42,19 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """Splats on their way to the image plane; made by `expose`."""
+class ProjectedFrame:
+    """Splats whose projection is queued; made by `project_frame`."""
 
     settings: Settings
     queued: Queued
 
     @exclusive
-    def develop(self, background: Any, like: Picture | None = None) -> Picture:
+    def blend(self, background: Any, like: Frame | None = None) -> Frame:
         """Wait for the projection and begin to blend.
 
         Args:
             background: [3] in [0, 1], a flat Dr.Jit array.
-            like: an earlier picture of this size, best the last of the film. What its tiles took tells which of this
+            like: an earlier frame of this size, best the last of the film. What its tiles took tells which of this
                 one's should be blended side by side; it changes no pixel.
 
         Raises:
@@ -67,14 +67,14 @@ class Exposure:
             raise ValueError("every value of the splats and the camera must be finite in float32")
         work = None if like is None else like.work
         lists = build(be, projected, self.settings, work) if projected.pairs else empty(be, self.settings)
-        kernel = _printing(be, lists.columns, lists.rows, self.settings)
+        kernel = _blend_kernel(be, lists.columns, lists.rows, self.settings)
         with stage("blend"):
             words, work = kernel(projected.records, lists.ids, lists.start, lists.order, background)
-        return Picture(words, work, self.settings.width, self.settings.height)
+        return Frame(words, work, self.settings.width, self.settings.height)
 
 
 @exclusive
-def expose(
+def project_frame(
     means: Any,
     quats: Any,
     scales: Any,
@@ -84,10 +84,10 @@ def expose(
     intrinsics: Any,
     width: int,
     height: int,
-) -> Exposure:
+) -> ProjectedFrame:
     """Begin to project N >= 1 splats, for a picture as `rasterization` makes it, rounded to bytes.
 
-    What follows needs the number of tiles that the splats cover. Whatever else is queued before `develop` asks for it,
+    What follows needs the number of tiles that the splats cover. Whatever else is queued before `blend` asks for it,
     such as the picture before this one, is done meanwhile.
 
     Args:
@@ -109,7 +109,7 @@ def expose(
     settings.check()
     project = _projection(be, dr.width(opacities), settings)
     with stage("project"):
-        return Exposure(settings, Queued(*project(means, quats, scales, opacities, colors, view, intrinsics)))
+        return ProjectedFrame(settings, Queued(*project(means, quats, scales, opacities, colors, view, intrinsics)))
 
 
 @lru_cache(maxsize=RECORDINGS)
@@ -124,18 +124,18 @@ def _projection(be: Backend, count: int, settings: Settings) -> Callable[..., An
 
 
 @lru_cache(maxsize=RECORDINGS)
-def _printing(be: Backend, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
+def _blend_kernel(be: Backend, columns: int, rows: int, settings: Settings) -> Callable[..., Any]:
     """The kernel of one image size, traced at its first call; see `_blend._recorded`."""
 
     def run(records: Any, ids: Any, start: Any, order: Any, background: Any) -> Any:
-        return _print(
+        return _blend_to_bytes(
             be, records, TileLists(ids, start, order, columns, rows, settings.options.list_width), background, settings
         )
 
     return recorded(run)
 
 
-def _print(be: Backend, records: Any, lists: TileLists, background: Any, settings: Settings) -> Any:
+def _blend_to_bytes(be: Backend, records: Any, lists: TileLists, background: Any, settings: Settings) -> Any:
     J = be.plain
     tile, state, last = accumulate(be, records, lists, CHANNELS, settings)
     behind = [dr.gather(J.Float, background, J.UInt32(f)) for f in range(CHANNELS)]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ._inputs import check_finite
+from .constants import SH_C0
 
-_C0 = 0.28209479177387814
 _HEADER_LIMIT = 1 << 16
 _REST = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest properties -> harmonic degree
 _TYPES = {
@@ -51,8 +51,8 @@ class SplatFile:
 
     @property
     def colors(self) -> Tensor:
-        """[N, 3] colours without their view-dependent part: 0.5 + C0 * harmonics[:, 0]."""
-        return 0.5 + _C0 * self.harmonics[:, 0]
+        """[N, 3] colours without their view-dependent part: 0.5 + SH_C0 * harmonics[:, 0]."""
+        return 0.5 + SH_C0 * self.harmonics[:, 0]
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def save_ply(
         ValueError: a tensor has a wrong shape or holds a NaN or an infinity.
     """
     n = len(means)
-    harmonics = ((colors - 0.5) / _C0)[:, None] if colors.ndim == 2 else colors
+    harmonics = ((colors - 0.5) / SH_C0)[:, None] if colors.ndim == 2 else colors
     shapes = {
         "means": (means, (n, 3)),
         "quats": (quats, (n, 4)),

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from drjit_splat import rasterization, reference
-from drjit_splat.frames import Picture, expose
+from drjit_splat.frames import Frame, project_frame
 from tests.drjit_splat.common import random_scene
 
 SIZE = (61, 47)
@@ -18,9 +18,9 @@ def flat(values: Tensor) -> Any:
     return Float(values.flatten().numpy())
 
 
-def picture(scene: dict[str, Tensor], size: tuple[int, int] = SIZE, like: Picture | None = None) -> Picture:
+def picture(scene: dict[str, Tensor], size: tuple[int, int] = SIZE, like: Frame | None = None) -> Frame:
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
-    return expose(*(flat(scene[name]) for name in names), *size).develop(flat(scene["backgrounds"]), like)
+    return project_frame(*(flat(scene[name]) for name in names), *size).blend(flat(scene["backgrounds"]), like)
 
 
 def test_bytes_are_the_oracles_rounded() -> None:
@@ -60,8 +60,8 @@ def test_an_earlier_picture_changes_no_pixel() -> None:
 def test_frames_may_overlap() -> None:
     scenes = [random_scene(width=SIZE[0], height=SIZE[1], seed=seed) for seed in range(2)]
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
-    exposures = [expose(*(flat(scene[name]) for name in names), *SIZE) for scene in scenes]
-    pictures = [e.develop(flat(s["backgrounds"])) for e, s in zip(exposures, scenes, strict=True)]
+    projected = [project_frame(*(flat(scene[name]) for name in names), *SIZE) for scene in scenes]
+    pictures = [e.blend(flat(s["backgrounds"])) for e, s in zip(projected, scenes, strict=True)]
     for found, scene in zip(pictures, scenes, strict=True):
         assert np.array_equal(found.numpy(), picture(scene).numpy())
 

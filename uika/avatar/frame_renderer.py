@@ -20,7 +20,7 @@ from uika.io.progress import counted
 from uika.motion import Motion
 
 if TYPE_CHECKING:
-    from drjit_splat.frames import Exposure, Picture
+    from drjit_splat.frames import Frame, ProjectedFrame
 
 _BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
 
@@ -58,7 +58,7 @@ class FrameRenderer:
             vertices = pose_vertices(self._head, own)
             return vertices, rigid_turn(self.canonical, vertices)
 
-    def expose(self, vertices: Tensor, turn: Tensor, camera: Camera) -> Exposure:
+    def project(self, vertices: Tensor, turn: Tensor, camera: Camera) -> ProjectedFrame:
         """Begin with one frame: queue its Gaussians and their projection; nothing is waited for.
 
         Args:
@@ -66,15 +66,15 @@ class FrameRenderer:
             turn: [4] its rigid turn.
             camera: one camera.
         """
-        from drjit_splat.frames import expose
+        from drjit_splat.frames import project_frame
 
         posed = self.rig.pose(vertices, turn)
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
-        return expose(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
+        return project_frame(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
 
-    def develop(self, exposure: Exposure, last: Picture | None = None) -> Picture:
-        """Wait for an exposure's projection and queue the rest; quicker with the `last` picture of the film."""
-        return exposure.develop(self._background, last)
+    def blend(self, projected: ProjectedFrame, last: Frame | None = None) -> Frame:
+        """Wait for a frame's projection and queue the rest; quicker with the `last` frame of the film."""
+        return projected.blend(self._background, last)
 
 
 def film(
@@ -112,18 +112,18 @@ def film(
     renderer = FrameRenderer(avatar, model, background)
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
-    picture: Picture | None = None
+    frame: Frame | None = None
     for index in counted(range(len(motion)), progress, len(motion), "frames"):
         place = index % _BLOCK
         if place == 0:
             vertices, turns = renderer.meshes(params[index : index + _BLOCK])
-        exposure = renderer.expose(vertices[place], turns[place], path[index])
-        done = None if picture is None else picture.numpy()
-        picture = renderer.develop(exposure, picture)
+        projected = renderer.project(vertices[place], turns[place], path[index])
+        done = None if frame is None else frame.numpy()
+        frame = renderer.blend(projected, frame)
         if done is not None:
             yield done
-    if picture is not None:
-        yield picture.numpy()
+    if frame is not None:
+        yield frame.numpy()
 
 
 def _personal(head: HeadModel, identity: Tensor, canonical: Tensor) -> HeadModel:

@@ -77,7 +77,7 @@ class LiveSplats:
     def draw(self, params: HeadParameters, camera: Camera) -> NDArray[np.uint8]:
         """The picture [H,W,3] of one pose, by the rasterizer, in the colours that are shown."""
         vertices, turn = self._renderer.meshes(_many(params))
-        return self._renderer.develop(self._renderer.expose(vertices[0], turn[0], camera)).numpy()
+        return self._renderer.blend(self._renderer.project(vertices[0], turn[0], camera)).numpy()
 
 
 def _many(params: HeadParameters) -> HeadParameters:
