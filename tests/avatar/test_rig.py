@@ -6,10 +6,16 @@ import torch
 from drjit_splat.profiling import profile
 from tests.head.test_binding import gaussians_on
 from tests.head.test_posing import posed_parameters
+from tests.heads import sphere_head
 from uika.avatar.rig import Rig
 from uika.head import HeadModel, HeadParameters, load_head, pose_gaussians, pose_vertices
 from uika.head.binding import rigid_turn
 from uika.motion.presets import expression_vector
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return sphere_head()
 
 
 def posed_both_ways(head: HeadModel, vertices: torch.Tensor, size: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
