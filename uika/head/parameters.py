@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from dataclasses import replace as dataclass_replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,7 +61,8 @@ class HeadParameters:
     @property
     def batch_shape(self) -> torch.Size:
         """The broadcast batch dimensions of all fields."""
-        return torch.broadcast_shapes(*(getattr(self, f.name).shape[:-1] for f in fields(self)))
+        # numpy's, as torch's loads its compiler.
+        return torch.Size(np.broadcast_shapes(*(getattr(self, f.name).shape[:-1] for f in fields(self))))
 
     def replace(self, **changes: Tensor) -> HeadParameters:
         """A copy with the named fields exchanged."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,7 +67,7 @@ def _joint_rotations(params: HeadParameters) -> Tensor:
 
 
 def _transforms(joints: Tensor, rotations: Tensor, translation: Tensor) -> Tensor:
-    batch = torch.broadcast_shapes(joints.shape[:-2], rotations.shape[:-3], translation.shape[:-1])
+    batch = np.broadcast_shapes(joints.shape[:-2], rotations.shape[:-3], translation.shape[:-1])
     joints = joints.expand(*batch, -1, -1)
     rotations = rotations.expand(*batch, -1, -1, -1)
     world_rotations: list[Tensor] = []

@@ -163,8 +163,10 @@ class VisionTransformer(nn.Module):
         super().__init__()
         self.taps = config.taps
         self.patch_size = config.patch_size
-        self.cls_token = nn.Parameter(0.02 * torch.randn(1, 1, config.dim))
-        self.storage_tokens = nn.Parameter(0.02 * torch.randn(1, config.storage_tokens, config.dim))
+        self.cls_token = nn.Parameter(torch.empty(1, 1, config.dim))
+        self.storage_tokens = nn.Parameter(torch.empty(1, config.storage_tokens, config.dim))
+        nn.init.normal_(self.cls_token, std=0.02)
+        nn.init.normal_(self.storage_tokens, std=0.02)
         self.patch_embed = PatchEmbed(config.dim, config.patch_size)
         self.rope_embed = RotaryPositions(config.dim // config.heads)
         self.blocks = nn.ModuleList(Block(config.dim, config.heads, config.layer_scale) for _ in range(config.depth))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from uika.io.files import write_tensors
 from uika.model.config import PRESETS, ModelConfig
@@ -73,7 +75,7 @@ def load_checkpoint(path: str | Path) -> Reconstructor:
         raise CheckpointError(f"{path}: no such model file")
     config, tensors = _read(path)
     try:
-        with torch.device("meta"):
+        with _Uninitialised():
             model = Reconstructor(config)
     except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise CheckpointError(f"{path}: its config describes no model ({error})") from error
@@ -133,3 +135,17 @@ def listing(kind: str, names: list[str]) -> str:
         return ""
     rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return f"{kind}: {', '.join(names[:_LISTED])}{rest}"
+
+
+class _Uninitialised(TorchFunctionMode):
+    """Leaves memory as it was allocated where `torch.nn.init` would draw: the file's weights take its place.
+
+    The meta device would do so too, but loads torch's compiler, which takes a second.
+    """
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if getattr(func, "__module__", "") == "torch.nn.init":
+            return args[0] if args else (kwargs or {})["tensor"]
+        return func(*args, **(kwargs or {}))
