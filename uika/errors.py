@@ -24,6 +24,10 @@ class UikaError(ValueError):
     """Input that cannot be used; the message is one sentence that names the argument or file and says what to do."""
 
 
+class UikaWarning(UserWarning):
+    """Input that is used although something about it is doubtful; the message is one sentence like an error's."""
+
+
 def install_command(module: str) -> str | None:
     """The pip command that brings the package imported as `module`; None when no extra of this project does."""
     extra = EXTRAS.get(module.partition(".")[0])

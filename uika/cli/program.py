@@ -9,7 +9,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 # Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
@@ -17,7 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # numpy is used for many small products only, which its threads would slow down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from uika.errors import UikaError, install_command
+from uika.errors import UikaError, UikaWarning, install_command
 
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
 _PATIENCE = 1.5  # seconds from an interrupt to the end
@@ -42,7 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _choose_head([argument for argument in arguments if argument != "--debug"])
         if arguments in ([], ["-h"], ["--help"]):
             return _overview(asked=bool(arguments))
-        return _parse(arguments).run()
+        command = _parse(arguments)
+        with warnings_as_sentences():
+            return int(command.run())
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
@@ -64,6 +68,23 @@ def run() -> NoReturn:
     _watch_for_interrupts()
     _is_process.set()
     sys.exit(main())
+
+
+@contextmanager
+def warnings_as_sentences() -> Iterator[None]:
+    """Doubts about the input are one line each on stderr; other warnings stay what they are."""
+    with warnings.catch_warnings():
+        plain = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if issubclass(category, UikaWarning):
+                print(f"uika: warning: {message}", file=sys.stderr)
+            else:
+                plain(message, category, *place, **more)
+
+        warnings.showwarning = show
+        warnings.simplefilter("always", UikaWarning)
+        yield
 
 
 def _say_interrupted() -> None:

@@ -30,7 +30,8 @@ class Track:
 
     def run(self) -> int:
         """Track and save."""
-        target = check_output(self.output, self.output.suffix if self.output.suffix in (".csv", ".json") else ".npz")
+        suffix = self.output.suffix.lower()
+        target = check_output(self.output, suffix if suffix in (".csv", ".json") else ".npz")
         picture = None if self.preview is None else check_output(self.preview, ".mp4")
         from uika.head import load_head
         from uika.motion import save_motion, write_csv, write_json
@@ -38,10 +39,10 @@ class Track:
 
         head = load_head()
         found = track_video(self.video, head, progress=True)
-        if target.suffix == ".npz":
+        if suffix == ".npz":
             save_motion(found.motion, target, head)
         else:
-            write = write_csv if target.suffix == ".csv" else write_json
+            write = write_csv if suffix == ".csv" else write_json
             write(found.motion, target, head.expression_names)
         if picture is not None:
             write_preview(found, self.video, picture, head, progress=True)

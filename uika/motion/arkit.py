@@ -3,55 +3,83 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from uika.head.actions import ARKIT_ACTIONS
 from uika.io.files import check_output, replacing
+from uika.motion.action_names import HEAD_ANGLES
+from uika.motion.arkit_json import parse
 from uika.motion.motion import Motion, MotionError
+from uika.motion.recording import Recording, from_file, to_angles
 
-FPS = 60.0  # of phones, where the file does not say
-_HEAD_ANGLES = ("headYaw", "headPitch", "headRoll")
-_SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
-_TIME = re.compile(r"(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)")
+_TIMECODE = re.compile(r"(\d{1,4}):(\d{1,4}):(\d{1,4})[:;.](\d{1,4}(?:\.\d+)?)")
+_RATES = (24, 25, 30, 48, 50, 60, 100, 120, 240)  # what the last part of a timecode counts, frames per second
+_NUMBERED = ("timestamp", "time", "seconds")
 _PLACE = {name: index for index, name in enumerate(ARKIT_ACTIONS)}
 
 
 def read_csv(path: str | Path) -> Motion:
-    """A Live Link Face recording as a motion of the ARKit actions in the order of `ARKIT_ACTIONS`.
+    """A Live Link Face recording, or another table of named activations, as a motion in the order of `ARKIT_ACTIONS`.
 
     Head angles become the root's rotation: yaw about Y, then pitch about X, then roll about Z, radians. The frame rate
-    follows from the timecodes; 60 where they span less than two seconds.
+    follows from the timecodes, or from a column of times; 60 where they span less than two seconds. Cells may be parted
+    by commas, semicolons (then with decimal commas) or tabs. Rows without a face, which Live Link Face writes with a
+    `BlendShapeCount` of 0, are filled in from their neighbours; see `uika.motion.recording.to_motion`.
 
     Raises:
-        MotionError: the file is missing or damaged, or has no column named as an action.
+        MotionError: the file is missing or damaged, has no column named as an action, or one that is not understood.
     """
-    place = Path(path)
-    try:
-        with place.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except (OSError, ValueError, csv.Error) as error:
-        raise MotionError(f"{place}: cannot be read as a table ({error})") from error
-    columns = {_action(name): index for index, name in enumerate(rows[0])} if rows else {}
-    if not set(columns) & set(ARKIT_ACTIONS):
-        raise MotionError(f"{place}: its first line names no ARKit actions such as EyeBlinkLeft")
-    body = rows[1:]
+    return from_file(Path(path), "a table", _table)
 
-    def values(names: Sequence[str]) -> Tensor:
-        cells = [[float(row[columns[name]]) if name in columns else 0.0 for name in names] for row in body]
-        return torch.tensor(cells).reshape(len(body), len(names))
 
+def _table(text: str) -> Recording:
+    first = text.lstrip().partition("\n")[0]
+    mark = max(",;\t", key=first.count)
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=mark)
     try:
-        stamps = [row[columns["timecode"]] for row in body] if "timecode" in columns else []
-        return _motion(values(ARKIT_ACTIONS), _frame_rate(stamps), _from_angles(values(_HEAD_ANGLES)))
-    except (ValueError, IndexError) as error:
-        raise MotionError(f"{place}: a line is damaged or has missing cells ({error})") from error
+        rows = [(lines.line_num, row) for row in lines if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise MotionError(f"line {lines.line_num} is damaged ({error})") from error
+    if not rows:
+        raise MotionError("its first line names no ARKit actions such as EyeBlinkLeft; the file is empty")
+    names = [cell.strip() for cell in rows[0][1]]
+    while names and not names[-1]:  # spreadsheets end lines with a mark
+        names.pop()
+    plain = {name.lower(): index for index, name in enumerate(names)}
+    found: list[dict[str, float | None] | None] = []
+    for line, row in rows[1:]:
+        cells = [cell.strip().replace(",", ".") if mark == ";" else cell.strip() for cell in row]
+        found.append(_cells(names, plain, cells, line))
+    if not found:
+        raise MotionError("has no rows below its names")
+    times, fps = _times(plain, [row for _, row in rows[1:]])
+    return Recording(found, [f"line {line}" for line, _ in rows[1:]], times, fps)
+
+
+def _cells(names: list[str], plain: dict[str, int], cells: list[str], line: int) -> dict[str, float | None] | None:
+    """Numbers of one row by name; None where it has no face."""
+    count = plain.get("blendshapecount")
+    if count is not None and count < len(cells) and cells[count] in ("0", "0.0"):
+        return None
+    if len(cells) < len(names) or any(cells[len(names) :]):
+        raise MotionError(f"line {line} is damaged or has missing cells: {len(cells)} for {len(names)} names")
+    values: dict[str, float | None] = {}
+    for name, cell in zip(names, cells, strict=False):
+        if name.lower() == "timecode":
+            continue
+        try:
+            values[name] = float(cell) if cell else None
+        except ValueError:
+            raise MotionError(f"line {line} is damaged: {name} is {cell[:40]!r}") from None
+    faces = [value for name, value in values.items() if name.lower() not in (*_NUMBERED, "frame", "blendshapecount")]
+    return None if all(value is None for value in faces) else values
 
 
 def write_csv(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
@@ -65,8 +93,8 @@ def write_csv(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
     Raises:
         MotionError: the names are not actions or not one for each column.
     """
-    values, angles = _ordered(motion, names), _to_angles(motion.rotation)
-    header = ["timecode", "blendShapeCount", *ARKIT_ACTIONS, *_HEAD_ANGLES]
+    values, angles = _ordered(motion, names), to_angles(motion.rotation)
+    header = ["timecode", "blendShapeCount", *ARKIT_ACTIONS, *HEAD_ANGLES]
     with replacing(check_output(path, ".csv")) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(name[0].upper() + name[1:] for name in header)
@@ -80,25 +108,16 @@ def write_csv(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
 def read_json(path: str | Path) -> Motion:
     """Named activations, in any order, as a motion of the ARKit actions in the order of `ARKIT_ACTIONS`.
 
-    Understood are one pose {"jawOpen": 0.2, ...}; a list of poses; {"fps": 30, "frames": [pose, ...]}; and
-    {"fps": 30, "names": [...], "frames": [[...], ...]}. A pose may lie inside "blendShapes" or "weights".
+    Understood are one pose {"jawOpen": 0.2, ...}; a list of poses, or one on each line; {"fps": 30, "frames": [pose,
+    ...]}; {"names": [...], "frames": [[...], ...]}, also with the numbers inside "weights" (LAM, BEAT) or as
+    {"facsNames", "weightMat"} (Audio2Face); {"jawOpen": [...], ...}; and lists of MediaPipe's categories. A pose may
+    lie inside "blendShapes" or "weights". Frames that bear a "time" or "timestamp" keep it; without times and rate
+    there are 60 a second. Empty poses and nulls are filled in; see `uika.motion.recording.to_motion`.
 
     Raises:
-        MotionError: the file is missing, no JSON of these kinds, or names none of the actions.
+        MotionError: the file is missing, no JSON of these kinds, names none of the actions or what is none.
     """
-    place = Path(path)
-    try:
-        content = json.loads(place.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise MotionError(f"{place}: cannot be read as JSON ({error})") from error
-    try:
-        poses, fps = _poses(content)
-        named = [{_action(name): value for name, value in pose.items()} for pose in poses]
-        if not any(set(pose) & set(ARKIT_ACTIONS) for pose in named):
-            raise MotionError("names no ARKit actions such as jawOpen")
-        return _motion(torch.tensor([[float(pose.get(name, 0.0)) for name in ARKIT_ACTIONS] for pose in named]), fps)
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise MotionError(f"{place}: {error}") from error
+    return from_file(Path(path), "JSON", parse)
 
 
 def write_json(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
@@ -106,16 +125,6 @@ def write_json(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
     frames = [dict(zip(ARKIT_ACTIONS, row, strict=True)) for row in _ordered(motion, names).tolist()]
     with replacing(check_output(path, ".json")) as temporary:
         temporary.write_text(json.dumps({"fps": motion.fps, "frames": frames}), encoding="utf-8")
-
-
-def _action(name: str) -> str:
-    name = str(name).strip()
-    return name[:1].lower() + name[1:]
-
-
-def _motion(actions: Tensor, fps: float, rotation: Tensor | None = None) -> Motion:
-    rest = {name: torch.zeros(len(actions), size) for name, size in _SIZES.items()}
-    return Motion(expression=actions, fps=fps, **{**rest, **({} if rotation is None else {"rotation": rotation})})
 
 
 def _ordered(motion: Motion, names: Sequence[str]) -> Tensor:
@@ -129,65 +138,35 @@ def _ordered(motion: Motion, names: Sequence[str]) -> Tensor:
     return result
 
 
-def _poses(content: Any) -> tuple[list[dict[str, Any]], float]:
-    fps = FPS
-    if isinstance(content, dict):
-        fps = float(content["fps"] if "fps" in content else content.get("frameRate", FPS))
-        frames = content.get("frames")
-        if frames is None:
-            frames = [content]
-        elif "names" in content:
-            frames = [dict(zip(content["names"], frame, strict=True)) for frame in frames]
-    else:
-        frames = content
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise MotionError("needs one pose {action: value} or a list of them")
-    poses = []
-    for frame in frames:
-        inner = next((frame[key] for key in ("blendShapes", "blendshapes", "weights") if key in frame), frame)
-        poses.append(inner)
-    return poses, fps
+def _times(plain: dict[str, int], rows: list[list[str]]) -> tuple[list[float] | None, float | None]:
+    """Times of the rows, in seconds for timecodes, and the frame rate where times do not tell it."""
+    if "timecode" in plain:
+        return _from_timecodes([row[plain["timecode"]] if plain["timecode"] < len(row) else "" for row in rows])
+    for name in _NUMBERED:
+        if name in plain:
+            try:
+                return [float(row[plain[name]].replace(",", ".")) for row in rows], None
+            except (ValueError, IndexError):
+                return None, None
+    return None, None
 
 
-def _frame_rate(stamps: list[str]) -> float:
-    """Frames per second from the seconds in the timecodes; frames within a second may be missing."""
-    seconds = []
+def _from_timecodes(stamps: list[str]) -> tuple[list[float] | None, float | None]:
+    seconds, frames = [], []
     for stamp in stamps:
-        if (match := _TIME.match(stamp.strip())) is None:
-            return FPS
-        hours, minutes, whole = (int(match[k]) for k in (1, 2, 3))
-        seconds.append(3600 * hours + 60 * minutes + whole)
-    changes = [index for index in range(1, len(seconds)) if seconds[index] != seconds[index - 1]]
-    if len(changes) < 2:
-        return FPS
-    elapsed = seconds[changes[-1]] - seconds[changes[0]]
-    rate = (changes[-1] - changes[0]) / elapsed if elapsed > 0 else FPS
-    return float(round(rate)) if 1 <= rate <= 240 else FPS
-
-
-def _from_angles(angles: Tensor) -> Tensor:
-    """Axis-angle [T,3] of yaw, pitch and roll [T,3]."""
-    from uika.head import rodrigues
-
-    yaw, pitch, roll = (
-        torch.zeros(len(angles), 3).index_copy(1, torch.tensor([axis]), angles[:, [k]])
-        for k, axis in enumerate((1, 0, 2))
-    )
-    return _axis_angle(rodrigues(yaw) @ rodrigues(pitch) @ rodrigues(roll))
-
-
-def _to_angles(rotation: Tensor) -> Tensor:
-    from uika.head import rodrigues
-
-    m = rodrigues(rotation)
-    yaw, roll = torch.atan2(m[:, 0, 2], m[:, 2, 2]), torch.atan2(m[:, 1, 0], m[:, 1, 1])
-    return torch.stack((yaw, torch.asin((-m[:, 1, 2]).clamp(-1, 1)), roll), -1)
-
-
-def _axis_angle(matrix: Tensor) -> Tensor:
-    twist = torch.stack(
-        (matrix[:, 2, 1] - matrix[:, 1, 2], matrix[:, 0, 2] - matrix[:, 2, 0], matrix[:, 1, 0] - matrix[:, 0, 1]), -1
-    )
-    sine = twist.norm(dim=-1, keepdim=True) / 2
-    angle = torch.atan2(sine, (matrix.diagonal(dim1=1, dim2=2).sum(-1, keepdim=True) - 1) / 2)
-    return twist / 2 * torch.where(sine > 1e-9, angle / sine.clamp_min(1e-9), 1.0)
+        if (match := _TIMECODE.match(stamp.strip())) is None:
+            return None, None
+        seconds.append(3600 * int(match[1]) + 60 * int(match[2]) + int(match[3]))
+        frames.append(float(match[4]))
+    if len(set(seconds)) < 3:  # no whole second, whose last frame would tell the rate
+        return None, None
+    counted = next((rate for rate in _RATES if max(frames) < rate), None)
+    if counted is None:
+        return None, None
+    days = 0
+    times = []
+    for index, (second, frame) in enumerate(zip(seconds, frames, strict=True)):
+        if index and second < seconds[index - 1] - 43200:  # past midnight
+            days += 1
+        times.append(86400 * days + second + frame / counted)
+    return times, None

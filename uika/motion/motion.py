@@ -57,7 +57,8 @@ class Motion:
                 raise MotionError(f"motion array '{name}' has shape {list(tensor.shape)} where {list(shape)} is needed")
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
-                raise MotionError(f"motion array '{name}' holds values that are not finite")
+                first = int((~torch.isfinite(tensor)).nonzero()[0, 0])
+                raise MotionError(f"motion array '{name}' holds values that are not finite, first in frame {first}")
         if not 0 < self.fps <= _MAX_FPS:
             raise MotionError(
                 f"motion has {self.fps} frames per second; it must be more than 0 and at most {_MAX_FPS:g}"

@@ -33,9 +33,9 @@ def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = No
         MotionError: the file is missing, damaged or of an unknown kind, or a FLAME head is needed and not given.
     """
     place = Path(path)
-    if place.is_dir() or (place.suffix == ".npz" and is_flame_params(place)):
+    if place.is_dir() or (place.suffix.lower() == ".npz" and is_flame_params(place)):
         return _from_flame(read_flame_params(place), head, source, place)
-    if place.suffix == ".npz":
+    if place.suffix.lower() == ".npz":
         return load_motion(place, head)
     if place.suffix.lower() == ".csv":
         return _from_actions(read_csv(place), head)
