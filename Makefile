@@ -4,6 +4,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.10 python3; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' 2>/dev/null && echo $$p && break; done)
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# All packages are resolved together, so that none brings another build of torch.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --group dev --group docs
 # Idle OpenMP threads would spin on the cores Dr.Jit needs.
 export OMP_WAIT_POLICY ?= passive
 
@@ -15,17 +17,22 @@ $(READY): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.10, 3.11 or 3.12 is needed; set PYTHON=/path/to/python"; exit 1; }
 	@echo "installing into $(VENV): some minutes, about 3 GB"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'  # knows dependency groups
+	$(INSTALL) -e '.[all]'
 	@touch $@
 
 .PHONY: llvm
 llvm: $(READY)
-	@$(BIN)/python tools/setup_llvm.py
+	@$(BIN)/python -m tools.setup_llvm
+
+.PHONY: chromium
+chromium: $(READY)
+	@$(BIN)/python -m tools.setup_chromium
 
 demo: setup
 	$(BIN)/uika demo -o out/demo
 
-test: setup
+test: setup chromium
 	$(BIN)/python -m pytest -q
 
 # Ten thousand random scenes, 200 extreme ones, 100,000 damaged files, stopped commands: hours. Goes on where it was stopped.
@@ -36,7 +43,7 @@ stress: setup
 	$(BIN)/python -m tests.stress.report
 	$(BIN)/python tools/readme_figures.py
 
-test-all: setup
+test-all: setup chromium
 	$(BIN)/python -m pytest -q -m "slow or not slow"
 
 lint: setup
@@ -61,7 +68,7 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 bake: setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,bake]'
+	$(INSTALL) -e '.[all,bake]'
 	$(BIN)/python tools/bake_head.py
 
 clean:

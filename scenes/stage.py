@@ -152,11 +152,11 @@ def load_stage(head: HeadModel, width: int, height: int, light: Light, integrato
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         files = {"mesh": folder / "head.ply", "texture": folder / "texture.exr"}
-        _write_mesh(mi, head.template.numpy()[mesh.source], mesh.faces, mesh.texcoords, files["mesh"])
+        _write_mesh(head.template.numpy()[mesh.source], mesh.faces, mesh.texcoords, files["mesh"])
         mi.Bitmap(np.full((2, 2, 3), _DEFAULT_ALBEDO, np.float32)).write(str(files["texture"]))
         if light != "flat":
             files |= {"glasses": folder / "glasses.ply", "roughness": folder / "roughness.exr"}
-            _write_mesh(mi, *glasses_topology(), None, files["glasses"])
+            _write_mesh(*glasses_topology(), None, files["glasses"])
             mi.Bitmap(np.full((2, 2, 1), _DEFAULT_ROUGHNESS, np.float32)).write(str(files["roughness"]))
         if light == "environment":
             files["environment"] = folder / "environment.exr"
@@ -191,20 +191,16 @@ def _assign(params: Any, key: str, value: Any) -> None:
     params.set_property(target, kind, value)
 
 
-def _write_mesh(mi: Any, positions: np.ndarray, faces: np.ndarray, texcoords: np.ndarray | None, path: Path) -> None:
-    shape = mi.Mesh(
-        "mesh", len(positions), len(faces), has_vertex_normals=True, has_vertex_texcoords=texcoords is not None
-    )
-    params = mi.traverse(shape)
-    arrays = {"vertex_positions": positions, "vertex_normals": np.zeros_like(positions), "faces": faces}
+def _write_mesh(positions: np.ndarray, faces: np.ndarray, texcoords: np.ndarray | None, path: Path) -> None:
+    import trimesh
+
+    # The normals' values are set with every pose; without them the loaded mesh would have no place for any.
+    mesh = trimesh.Trimesh(positions, faces, vertex_normals=np.zeros_like(positions), process=False)
     if texcoords is not None:
-        arrays["vertex_texcoords"] = texcoords
-    for key, value in arrays.items():
-        params[key] = type(params[key])(np.ascontiguousarray(value).ravel())
-    params.update()
+        mesh.vertex_attributes.update({name: texcoords[:, axis] for axis, name in enumerate("uv")})
     try:
-        shape.write_ply(str(path))
-    except RuntimeError as error:
+        mesh.export(path, vertex_normal=True)
+    except OSError as error:
         folder = tempfile.gettempdir()
         raise UikaError(f"{folder}: a temporary mesh cannot be written; free space or set TMPDIR ({error})") from error
 

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -12,7 +11,8 @@ from typing import Any
 
 import pytest
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+from tools import setup_chromium
+
 _FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -113,7 +113,7 @@ class Page:
 @contextmanager
 def page(folder: Path, width: int = 900, height: int = 700) -> Iterator[Page]:
     """A tab of a browser with a fresh profile in `folder`; skips the test where there is no Chromium."""
-    program = next(filter(None, map(shutil.which, _NAMES)), None)
+    program = setup_chromium.find()
     if program is None:
         pytest.skip("no Chromium: install the package 'chromium' to test in a browser")
     connect = pytest.importorskip("websockets.sync.client", reason="no websockets: install the extra 'view'").connect

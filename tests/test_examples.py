@@ -26,8 +26,8 @@ def test_photo_becomes_a_marked_video(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nbclient = pytest.importorskip("nbclient", reason="no nbclient: install the extra 'dev'")
-    nbformat = pytest.importorskip("nbformat", reason="no nbformat: install the extra 'dev'")
+    nbclient = pytest.importorskip("nbclient", reason="no nbclient: install the group 'dev'")
+    nbformat = pytest.importorskip("nbformat", reason="no nbformat: install the group 'dev'")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
     book = nbformat.read(NOTEBOOK, as_version=4)
