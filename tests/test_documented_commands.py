@@ -21,6 +21,7 @@ import drjit_splat.cli
 import uika
 from tests.documented import PAGES, ROOT, examples, mentioned, shown
 from tests.filmed import act
+from tests.spoken import SENTENCE, spoken, write_wav
 from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
 from uika.cli.program import _parse, main
 from uika.export import posed_splats, write_ply
@@ -84,6 +85,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     act(head, place / "act.mp4")
     (place / "act.mp4").rename(place / "me.mov")
     write_ply(place / "scene.ply", posed_splats(avatar, head).half_turned())
+    write_wav(place / "voice.wav", spoken(SENTENCE).samples)
+    (place / "words.txt").write_text("Hello, nice to meet you.")
     view = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 256, "height": 256}
     (place / "cameras.json").write_text(json.dumps([view] * 4))
     return place

@@ -15,9 +15,12 @@ if TYPE_CHECKING:
     from uika.avatar.rendering import Rendering, frames, neutral_camera, render
     from uika.errors import UikaError
     from uika.head import Camera, HeadModel, HeadParameters, load_head
+    from uika.io.sound import Sound, read_sound
     from uika.io.video import write_png, write_video
     from uika.motion import Motion, MotionError, load_motion
     from uika.motion.presets import get_motion
+    from uika.motion.speech import speech
+    from uika.motion.voice import say
     from uika.reconstruction import GrowingAvatar, Reconstruction, reconstruct
 
 _HOMES = {
@@ -31,14 +34,18 @@ _HOMES = {
     "MotionError": "motion",
     "Reconstruction": "reconstruction",
     "Rendering": "avatar.rendering",
+    "Sound": "io.sound",
     "UikaError": "errors",
     "frames": "avatar.rendering",
     "get_motion": "motion.presets",
     "load_head": "head",
     "load_motion": "motion",
     "neutral_camera": "avatar.rendering",
+    "read_sound": "io.sound",
     "reconstruct": "reconstruction",
     "render": "avatar.rendering",
+    "say": "motion.voice",
+    "speech": "motion.speech",
     "write_png": "io.video",
     "write_video": "io.video",
 }
@@ -54,6 +61,7 @@ __all__ = [
     "MotionError",
     "Reconstruction",
     "Rendering",
+    "Sound",
     "UikaError",
     "__version__",
     "frames",
@@ -61,8 +69,11 @@ __all__ = [
     "load_head",
     "load_motion",
     "neutral_camera",
+    "read_sound",
     "reconstruct",
     "render",
+    "say",
+    "speech",
     "write_png",
     "write_video",
 ]

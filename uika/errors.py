@@ -5,6 +5,7 @@ from __future__ import annotations
 # Import name of each optional package -> the extra of this project that installs it.
 EXTRAS = {
     "av": "cli",
+    "openfacefx": "cli",
     "cv2": "photo",
     "PIL": "cli",
     "tqdm": "cli",

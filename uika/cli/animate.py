@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from uika.errors import UikaError
 from uika.io.files import check_output
 
 if TYPE_CHECKING:
     from uika.head import HeadModel
+    from uika.io.sound import Sound
     from uika.motion import Motion
+
+_LONGEST = 100_000  # bytes of a transcript
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,12 @@ class Animate:
     """orbit, talk, expressions, or a motion: .npz, ARKit .csv or .json, FLAME parameters (file or folder)."""
     video: Path | None = None
     """A video to be driven by, instead of a motion."""
+    speech: str | None = None
+    """A text to speak, or a recording (.wav, .mp3, ...) to be driven by and heard, instead of a motion."""
+    transcript: Path | None = None
+    """A text file with the words of the recording; the lips follow them closer."""
+    language: str | None = None
+    """Language of the text for espeak-ng, such as de; else guessed from its letters."""
     motion_head: Path | None = None
     """The FLAME head that FLAME parameters belong to."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
@@ -42,6 +52,7 @@ class Animate:
     def run(self) -> int:
         """Render and encode."""
         target = check_output(self.output, ".mp4")
+        self._check()
         from uika.avatar import Avatar
         from uika.avatar.frame_renderer import film
         from uika.avatar.rendering import check_renderer, check_view
@@ -53,7 +64,10 @@ class Animate:
         check_view(0.0, 0.0, check_even(self.size))
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
-        if self.video is None:
+        sound: Sound | None = None
+        if self.speech is not None:
+            motion, sound = self._spoken(self.speech, head)
+        elif self.video is None:
             source = None if self.motion_head is None else load_head(self.motion_head)
             motion = get_motion(self.motion, head, self.fps, source)
         check_renderer()
@@ -61,9 +75,33 @@ class Animate:
             motion = self._tracked(self.video, head)
         pictures = film(avatar, motion, head=head, size=self.size, progress=True)
         marked = map(mark, pictures) if self.watermark else pictures
-        count = write_video(target, marked, motion.fps, picture_provenance(avatar, watermark=self.watermark))
-        print(f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second")
+        provenance = picture_provenance(avatar, watermark=self.watermark)
+        count = write_video(target, marked, motion.fps, provenance, sound)
+        heard = "" if self.speech is None else ", with sound" if sound else ", silent: install espeak-ng for a voice"
+        print(
+            f"wrote {target}: {count} frames, {self.size}x{self.size} pixels, {motion.fps:g} frames per second{heard}"
+        )
         return 0
+
+    def _check(self) -> None:
+        if self.speech is not None and self.video is not None:
+            raise UikaError("--speech and --video both say how the head moves; give one of them")
+        if self.speech is None and (self.transcript is not None or self.language is not None):
+            raise UikaError("--transcript and --language go with --speech")
+
+    def _spoken(self, spoken: str, head: HeadModel) -> tuple[Motion, Sound | None]:
+        from uika.motion.speech import FPS, is_text, speech, voice_of
+
+        words = None
+        if is_text(spoken):
+            if self.transcript is not None:
+                raise UikaError("--transcript goes with a recording; --speech has a text, which is its own")
+            words = spoken
+        elif self.transcript is not None:
+            words = _read_transcript(self.transcript)
+        sound = voice_of(spoken, self.language)
+        heard = spoken if sound is None else sound
+        return speech(heard, words, head, self.fps or FPS, language=self.language), sound
 
     def _tracked(self, video: Path, head: HeadModel) -> Motion:
         from uika.cli.track import describe
@@ -72,3 +110,14 @@ class Animate:
         found = track_video(video, head, progress=True)
         print(f"tracked {video}: {describe(found)}")
         return found.motion if self.fps is None else found.motion.resampled(self.fps)
+
+
+def _read_transcript(path: Path) -> str:
+    if not path.is_file():
+        raise UikaError(f"{path}: no such text file")
+    if path.stat().st_size > _LONGEST:
+        raise UikaError(f"{path}: is longer than anybody speaks in ten minutes")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UikaError(f"{path}: is no text in UTF-8 ({error})") from error

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from uika.errors import UikaError
 from uika.io.files import check_output, replacing
+from uika.io.sound import Sound, SoundTrack
 
 _QUALITY = "18"  # x264's constant rate factor; visually lossless for most eyes
 _AHEAD = 4  # pictures that may wait for the encoder
@@ -48,7 +48,11 @@ def write_png(path: str | Path, rgb: Tensor, provenance: Mapping[str, str] | Non
 
 
 def write_video(
-    path: str | Path, pictures: Iterable[Picture], fps: float, provenance: Mapping[str, str] | None = None
+    path: str | Path,
+    pictures: Iterable[Picture],
+    fps: float,
+    provenance: Mapping[str, str] | None = None,
+    sound: Sound | None = None,
 ) -> int:
     """Write images [H,W,3] in [0,1], or as bytes, as H.264 in an MP4 that every player opens.
 
@@ -59,6 +63,7 @@ def write_video(
         pictures: images of one size with an even number of rows and columns, taken one at a time.
         fps: frames per second.
         provenance: kept as JSON in the file's comment.
+        sound: heard from the first picture on (AAC); what lasts longer than the pictures is left out.
 
     Returns:
         The number of frames.
@@ -81,9 +86,12 @@ def write_video(
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": _QUALITY}
+        track = None if sound is None else SoundTrack(container, sound)
 
-        def encode(image: NDArray[np.uint8]) -> None:
+        def encode(image: NDArray[np.uint8], end: float) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            if track is not None:
+                track.until(end)
 
         for picture in pictures:
             image = to_bytes(picture)
@@ -92,26 +100,18 @@ def write_video(
                 stream.height, stream.width = check_even(shape[0]), check_even(shape[1])
             if image.shape != shape:
                 raise UikaError(f"{target}: frame {count} has the size {image.shape[:2]}, the first one {shape[:2]}")
-            pending.append(encoder.submit(encode, image))
+            count += 1
+            pending.append(encoder.submit(encode, image, count / fps))
             if len(pending) > _AHEAD:
                 pending.popleft().result()
-            count += 1
         if count == 0:
             raise UikaError(f"{target}: there are no frames to write")
         while pending:
             pending.popleft().result()
         container.mux(stream.encode())
+        if track is not None:
+            track.finish()
     return count
-
-
-def open_video(path: Path) -> Any:
-    """An opened video (PyAV's container); what is not text in its metadata does not keep it from being read."""
-    import av
-
-    try:
-        return av.open(str(path), metadata_errors="replace")
-    except TypeError:  # newer versions of PyAV replace by themselves
-        return av.open(str(path))
 
 
 def check_even(size: int) -> int:

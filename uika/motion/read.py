@@ -38,18 +38,19 @@ def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = No
     if place.suffix.lower() == ".npz":
         return load_motion(place, head)
     if place.suffix.lower() == ".csv":
-        return _from_actions(read_csv(place), head)
+        return for_head(read_csv(place), head)
     if place.suffix.lower() == ".json":
-        return _from_actions(read_json(place), head)
+        return for_head(read_json(place), head)
     raise MotionError(f"{place}: is no motion; known are {', '.join(KINDS)} and folders of FLAME parameters")
 
 
-def _from_actions(motion: Motion, head: HeadModel) -> Motion:
+def for_head(motion: Motion, head: HeadModel) -> Motion:
+    """A motion of the ARKit actions, in the order of `ARKIT_ACTIONS`, in a head's own expressions."""
     if not has_actions(head):
         from uika.motion.retargeting import transfer
 
         builtin = load_head(HEAD)
-        return transfer(_from_actions(motion, builtin), builtin, head)
+        return transfer(for_head(motion, builtin), builtin, head)
     columns = motion.expression.new_zeros(len(motion), len(head.expression_names))
     columns[:, [head.expression_names.index(name) for name in ARKIT_ACTIONS]] = motion.expression
     return replace(motion, expression=columns)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from uika.errors import UikaError
+from uika.io.media import open_media
 from uika.io.npz import ArraysError, read_npz
-from uika.io.video import open_video
 from uika.safeguards.provenance import as_text
 from uika.safeguards.watermark import Detection, detect
 
@@ -84,7 +84,7 @@ def _video(path: Path) -> Finding:
     import av
 
     try:
-        with open_video(path) as container:
+        with open_media(path) as container:
             text = container.metadata.get("comment") or container.metadata.get("COMMENT") or ""
             frames = _spread(path, container)
     except UikaError:

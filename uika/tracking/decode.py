@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.errors import UikaError
-from uika.io.video import open_video
+from uika.io.media import open_media
 
 AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say
@@ -44,7 +44,7 @@ def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8]
     if not path.is_file():
         raise VideoError(f"{path}: no such video")
     try:
-        with open_video(path) as container:
+        with open_media(path) as container:
             if not container.streams.video:
                 raise VideoError(f"{path}: has no pictures in it")
             container.streams.video[0].thread_type = "AUTO"
@@ -106,7 +106,7 @@ def frame_rate(path: Path) -> float:
     import av
 
     try:
-        with open_video(path) as container:
+        with open_media(path) as container:
             rate = container.streams.video[0].average_rate
     except (av.FFmpegError, OSError, LookupError) as error:
         raise VideoError(f"{path}: cannot be read as a video ({error})") from error
