@@ -20,7 +20,8 @@ from benchmarks.figures import lines
 from benchmarks.harness import markdown, save
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
-from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+from scenes.synthesis.deferred import Shader, as_texture
+from scenes.synthesis.vertex_light import lit_scene
 from uika.head import HeadParameters, load_head, look_at, pose_vertices
 
 SAMPLES = (1, 4, 16, 64, 256)
@@ -96,10 +97,10 @@ def quality(size: int, reference_spp: int) -> list[dict[str, Any]]:
         reference(spp, 1)
         clock = time.perf_counter(), time.process_time()
         measure("direct", spp, reference(spp, 2)["rgb"], clock)
-    stage, texture = lit_stage(head, "studio"), as_texture(albedo, rough)
+    head_scene, texture = lit_scene(head, "studio"), as_texture(albedo, rough)
     for turn in range(2):
         clock = time.perf_counter(), time.process_time()
-        seen = Shader(stage, head, vertices, texture, seed=turn).view(camera, 4, ("uv",))
+        seen = Shader(head_scene, head, vertices, texture, seed=turn).view(camera, 4, ("uv",))
     measure("deferred", 4, scenes.linear_to_srgb(seen["rgb"]) * seen["mask"][..., None], clock)
     return rows
 

@@ -20,8 +20,9 @@ from benchmarks.figures import bars
 from benchmarks.harness import markdown, save
 from scenes.people import paint, sample_person
 from scenes.people.hair import hair_offsets
-from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+from scenes.synthesis.deferred import Shader, as_texture
 from scenes.synthesis.lighting import sample_lighting
+from scenes.synthesis.vertex_light import lit_scene
 from uika.data import Synthesis, synthesize
 from uika.data.encode import DEPTH_UNIT, UV_STEPS, encode_pixels, encode_uv
 from uika.data.identity import texture_size
@@ -88,15 +89,15 @@ def stages(size: int, frames: int) -> dict[str, float]:
     head = load_head()
     person = sample_person(3, head)
     lighting = sample_lighting(np.random.default_rng(2))
-    stage = lit_stage(head, lighting.light)
-    stage.set_lights(lighting.values)
+    head_scene = lit_scene(head, lighting.light)
+    head_scene.set_lights(lighting.values)
     vertices = pose_vertices(
         head, HeadParameters.zeros(head).replace(identity=person.shape), hair_offsets(person, head)
     )
     cameras = [place_camera(view, size, np.random.default_rng(0)) for view in viewpoints(VIEWS)]
     backdrops = [np.zeros((size, size, 3), np.uint8)] * VIEWS
     texture = as_texture(*paint(person, head, texture_size(size)))
-    shader = Shader(stage, head, vertices, texture, samples=32 if size < 256 else 64)
+    shader = Shader(head_scene, head, vertices, texture, samples=32 if size < 256 else 64)
     seen = list(shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT))
 
     def encode() -> None:
@@ -107,8 +108,8 @@ def stages(size: int, frames: int) -> dict[str, float]:
 
     return {
         "paint": _cpu(lambda: paint(person, head, texture_size(size))) / (VIEWS * frames),
-        "pose": _cpu(lambda: stage.pose(head, vertices)) / VIEWS,
-        "pose_and_light": _cpu(lambda: Shader(stage, head, vertices, texture, samples=32 if size < 256 else 64))
+        "pose": _cpu(lambda: head_scene.pose(head, vertices)) / VIEWS,
+        "pose_and_light": _cpu(lambda: Shader(head_scene, head, vertices, texture, samples=32 if size < 256 else 64))
         / VIEWS,
         "views": _cpu(lambda: list(shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT))) / VIEWS,
         "png": _cpu(encode) / VIEWS,

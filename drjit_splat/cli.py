@@ -29,7 +29,7 @@ _MAX_SIZE = 16384  # pixels
 
 
 @dataclass(frozen=True)
-class View:
+class PinholeCamera:
     """One pinhole camera, OpenCV axes."""
 
     viewmat: Tensor  # [4,4] world to camera
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
-def load_camera(path: str | Path, index: int = 0) -> View:
+def load_camera(path: str | Path, index: int = 0) -> PinholeCamera:
     """Read one camera of a JSON file.
 
     Args:
@@ -82,7 +82,7 @@ def load_camera(path: str | Path, index: int = 0) -> View:
         raise ValueError(f"{path}: camera {index} cannot be used ({type(error).__name__}: {error})") from None
 
 
-def fitting_view(splats: SplatFile, yaw: float, pitch: float, size: int, y_up: bool = False) -> View:
+def fitting_view(splats: SplatFile, yaw: float, pitch: float, size: int, y_up: bool = False) -> PinholeCamera:
     """A camera that sees nearly the whole scene.
 
     Args:
@@ -114,10 +114,10 @@ def fitting_view(splats: SplatFile, yaw: float, pitch: float, size: int, y_up: b
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     focal = size / 2 / math.tan(math.radians(_FOV / 2))
     K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return View(viewmat.float(), K, size, size)
+    return PinholeCamera(viewmat.float(), K, size, size)
 
 
-def _view(camera: Any) -> View:
+def _view(camera: Any) -> PinholeCamera:
     import torch
 
     width, height = int(camera["width"]), int(camera["height"])
@@ -134,7 +134,7 @@ def _view(camera: Any) -> View:
         K = torch.tensor([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
     if viewmat.shape != (4, 4) or K.shape != (3, 3):
         raise ValueError("viewmat must be 4x4 and K 3x3")
-    return View(viewmat.float(), K, width, height)
+    return PinholeCamera(viewmat.float(), K, width, height)
 
 
 def _render(arguments: argparse.Namespace) -> int:

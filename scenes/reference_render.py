@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from scenes.colour import linear_to_srgb, srgb_to_linear
+from scenes.head_scene import HeadScene, Light, load_head_scene
 from scenes.people.glasses import Glasses
-from scenes.stage import Light, Stage, load_stage
 from scenes.variant import FAST_VARIANT, load_mitsuba
 from uika.head import Camera, HeadModel
 
@@ -68,29 +68,29 @@ def render(
     points = _check_vertices(vertices, head)
     _check_camera(camera)
     albedo = None if texture is None else srgb_to_linear(_texture_array(texture))
-    stage = load_stage(head, camera.width, camera.height, light, integrator)
-    stage.update(
+    head_scene = load_head_scene(head, camera.width, camera.height, light, integrator)
+    head_scene.update(
         head, points, camera, albedo, None if roughness is None else np.asarray(roughness, np.float32), glasses
     )
     images: dict[str, np.ndarray] = {}
     backdrop = light == "portrait"
     with_colour = "rgb" in aovs or "linear" in aovs
     if with_colour or ("mask" in aovs and not backdrop):
-        images["linear"], images["mask"] = _radiance(stage, spp, seed, with_colour)
+        images["linear"], images["mask"] = _radiance(head_scene, spp, seed, with_colour)
         images["rgb"] = _composite(images["linear"], images["mask"], background)
     if any(name in aovs for name in _TRACED) or (backdrop and "mask" in aovs):
-        images.update(_centre_hits(stage, camera))
+        images.update(_centre_hits(head_scene, camera))
     if backdrop and "mask" in aovs:
         images["mask"] = (images["triangle"] >= 0).astype(np.float32)
     return {name: images[name] for name in aovs}
 
 
-def _radiance(stage: Stage, spp: int, seed: int, with_colour: bool) -> tuple[np.ndarray, np.ndarray]:
+def _radiance(head_scene: HeadScene, spp: int, seed: int, with_colour: bool) -> tuple[np.ndarray, np.ndarray]:
     """Linear premultiplied colour [H,W,3] and coverage [H,W]; the colour is meaningless without `with_colour`."""
     mi = load_mitsuba()
     # The depth integrator follows primary rays only and draws the same film positions, so the mask stays the same.
-    integrator = stage.scene.integrator() if with_colour else mi.load_dict({"type": "depth"})
-    image = np.array(mi.render(stage.scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
+    integrator = head_scene.scene.integrator() if with_colour else mi.load_dict({"type": "depth"})
+    image = np.array(mi.render(head_scene.scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
     return image[..., :3], np.clip(image[..., 3], 0, 1)
 
 
@@ -100,7 +100,7 @@ def _composite(colour: np.ndarray, coverage: np.ndarray, background: Sequence[fl
     return surface * alpha + np.asarray(background, np.float32) * (1 - alpha)
 
 
-def _centre_hits(stage: Stage, camera: Camera) -> dict[str, np.ndarray]:
+def _centre_hits(head_scene: HeadScene, camera: Camera) -> dict[str, np.ndarray]:
     """Depth, UV and triangle id of the first surface on the ray through each pixel centre."""
     mi = load_mitsuba()
     if mi.variant() != FAST_VARIANT:
@@ -110,10 +110,10 @@ def _centre_hits(stage: Stage, camera: Camera) -> dict[str, np.ndarray]:
     width, height = camera.width, camera.height
     index = dr.arange(mi.UInt32, width * height)
     position = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
-    ray, _ = stage.sensor.sample_ray(0.0, 0.0, position, mi.Point2f(0.5))
-    hit = stage.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, coherent=True)
+    ray, _ = head_scene.sensor.sample_ray(0.0, 0.0, position, mi.Point2f(0.5))
+    hit = head_scene.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, coherent=True)
     found = hit.is_valid()
-    found &= hit.shape == mi.ShapePtr(stage.shape("head"))
+    found &= hit.shape == mi.ShapePtr(head_scene.shape("head"))
     forward = mi.Vector3f(*camera.viewmat[2, :3].double().tolist())
     z = dr.dot(forward, hit.p) + float(camera.viewmat[2, 3])
     depth, u, v = (dr.select(found, value, 0.0) for value in (z, hit.uv.x, hit.uv.y))

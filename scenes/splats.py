@@ -125,7 +125,7 @@ def _over(mi: Any, behind: Any, splats: Tensor, left: Tensor) -> Any:
 
 
 def _opencv(mi: Any, sensor: Any) -> tuple[Tensor, Tensor, int, int]:
-    """Matrices and size of a perspective sensor, see `scenes.stage`."""
+    """Matrices and size of a perspective sensor, see `scenes.head_scene`."""
     params = mi.traverse(sensor)
     width, height = (int(value) for value in sensor.film().crop_size())
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)

@@ -19,7 +19,9 @@ from uika import load_head
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = "reconstruct animate render track export view verify synthesize train evaluate head weights bench demo doctor"
+COMMANDS = (
+    "reconstruct animate render track export view verify synthesize train evaluate head weights bench demo doctor"
+)
 FEW = ("--identities", "2", "--views", "3", "--frames", "2", "--size", "128")
 
 
@@ -30,7 +32,9 @@ class Installed:
         self.folder, self._bin = place / "work", place / "venv" / ("Scripts" if os.name == "nt" else "bin")
         self.folder.mkdir()
         # Neither the checkout nor a variable of this process may lend a package.
-        self.environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL"))}
+        self.environment = {
+            key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL"))
+        }
         subprocess.run([sys.executable, "-m", "venv", str(place / "venv")], check=True)
         wanted = f"uika-drjit[{extra}] @ {wheel.as_uri()}" if extra else str(wheel)
         constraints = str(ROOT / "constraints.txt")
@@ -110,7 +114,11 @@ def test_cli_shows_help_renders_and_exports(installed: Installed, avatar: Path) 
 @only("photo")
 def test_photo_reconstructs(installed: Installed) -> None:
     installed.run("uika", "demo", "-o", "demo")
-    assert {path.name for path in (installed.folder / "demo").iterdir()} == {"avatar.safetensors", "talk.mp4", "sheet.png"}
+    assert {path.name for path in (installed.folder / "demo").iterdir()} == {
+        "avatar.safetensors",
+        "talk.mp4",
+        "sheet.png",
+    }
     installed.run("uika", "track", "demo/talk.mp4", "-o", "motion.npz", "--count", "3")
 
 
@@ -140,7 +148,9 @@ def test_view_serves_the_page(installed: Installed, avatar: Path) -> None:
 @only("train")
 def test_train_makes_data_trains_and_evaluates(installed: Installed) -> None:
     installed.run("uika", "synthesize", "-o", "people", *FEW)
-    installed.run("uika", "train", "--data", "people", "-o", "run", "--preset", "tiny", "--steps", "2", "--workers", "0")
+    installed.run(
+        "uika", "train", "--data", "people", "-o", "run", "--preset", "tiny", "--steps", "2", "--workers", "0"
+    )
     network = next(installed.folder.glob("run/*.safetensors"))
     given = ("--model", network, "--setting", "mono", "--views", "1", "--targets", "1", "--size", "96")
     installed.run("uika", "evaluate", "--data", "people", "-o", "report", "--correspondence", "exact", *given)

@@ -21,8 +21,9 @@ from torch import Tensor
 from scenes.colour import linear_to_srgb
 from scenes.people import paint, sample_person, wear_glasses
 from scenes.people.hair import hair_offsets
-from scenes.synthesis.deferred import Shader, as_texture, gather_light, lit_stage
+from scenes.synthesis.deferred import Shader, as_texture
 from scenes.synthesis.lighting import backdrop, sample_lighting
+from scenes.synthesis.vertex_light import gather_light, lit_scene
 from uika.assets import LANDMARK_BIAS
 from uika.data.performance import perform
 from uika.fitting.landmark_bias import upright, view_polynomials
@@ -82,8 +83,8 @@ def photograph(head: HeadModel, index: int) -> Iterator[tuple[np.ndarray, Camera
     random = np.random.default_rng([FIRST_SEED, index])
     person = sample_person(FIRST_SEED + index, head)
     lighting = sample_lighting(random)
-    stage = lit_stage(head, lighting.light)
-    stage.set_lights(lighting.values)
+    head_scene = lit_scene(head, lighting.light)
+    head_scene.set_lights(lighting.values)
     texture = as_texture(*paint(person, head, SIZE))
     hair = hair_offsets(person, head)
     params = perform(head, person.shape, 4 * FACES - 3, random)[torch.arange(0, 4 * FACES - 3, 4)]
@@ -93,14 +94,16 @@ def photograph(head: HeadModel, index: int) -> Iterator[tuple[np.ndarray, Camera
     params = params.replace(expression=strength * params.expression, rotation=still, neck=still, translation=still)
     bare = shaped_vertices(head, HeadParameters.zeros(head).replace(identity=person.shape))
     normals = vertex_normals(bare, head.faces)
-    stage.pose(head, bare + hair)
+    head_scene.pose(head, bare + hair)
     face = head.masks["face"] > 0.5
-    light = gather_light(stage, bare[face], normals[face], LIGHT_SAMPLES, index)[:, :3].mean()
+    light = gather_light(head_scene, bare[face], normals[face], LIGHT_SAMPLES, index)[:, :3].mean()
     posed, plain = pose_vertices(head, params, hair), pose_vertices(head, params)
     for n in range(FACES):
         glasses = wear_glasses(person.glasses, head, params[n], bare, person.shape) if person.glasses else None
         exposure = lighting.brightness / max(float(light), 1e-4)
-        shader = Shader(stage, head, posed[n], texture, glasses, exposure=exposure, samples=LIGHT_SAMPLES, seed=index)
+        shader = Shader(
+            head_scene, head, posed[n], texture, glasses, exposure=exposure, samples=LIGHT_SAMPLES, seed=index
+        )
         for _ in range(VIEWS):
             fov = random.uniform(*FOV)
             distance = random.uniform(*FIELD) / 2 / math.tan(math.radians(fov) / 2)

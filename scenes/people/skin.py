@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scenes.people.bleed import bleed
+from scenes.people.dilation import dilate
 from scenes.people.fields import Fields, atlas_fields
 from scenes.people.hair import beard_cover, hair_strands, hairline
 from scenes.people.noise import fractal_noise, smoothstep, value_noise
@@ -55,7 +55,7 @@ def paint(person: Person, head: HeadModel, size: int = 1024) -> tuple[np.ndarray
         if len(index):
             albedo[index], rough[index] = layer(fields.select(index), person, random, albedo[index], rough[index])
     values = fields.binding.to_map(torch.cat((albedo, rough[:, None]), -1))
-    spread = bleed(values, head, size)
+    spread = dilate(values, head, size)
     return spread[:3].permute(1, 2, 0).contiguous().numpy(), spread[3].numpy()
 
 

@@ -10,23 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 
 from scenes.arrays import aligned, flat
+from scenes.head_scene import HeadScene
 from scenes.people.glasses import Glasses, glasses_topology
-from scenes.stage import Light, Stage, load_stage
-from scenes.synthesis.shading import encode_srgb, highlight, pixel_pattern, plane_points
-from scenes.synthesis.wave import Wave, waves
-from scenes.variant import FAST_VARIANT, load_mitsuba
+from scenes.synthesis.launch import Launch, launches
+from scenes.synthesis.shading import encode_srgb, highlight, pixel_pattern
+from scenes.synthesis.vertex_light import gather_light, require_fast
+from scenes.variant import load_mitsuba
 from uika.head import Camera, HeadModel, vertex_normals
 
 LABELS = ("uv", "depth", "normal", "triangle")
 _CENTRE = (0.5, 0.5)
-_LIFT = 3e-4  # metres, from the vertex to the point that is lit: clear of its own triangles
 _RECORD = 16  # floats for each corner of the mesh
 _GLASSES_ROUGHNESS = 0.3
 
@@ -41,64 +40,12 @@ class StoredView:
     depth: np.ndarray  # [H,W] uint16, round(depth / unit), 0 for none
 
 
-def lit_stage(head: HeadModel, light: Light) -> Stage:
-    """A stage for `Shader`, which needs no image size, with the lamps of the scene file."""
-    stage = _used_stage(head, light)
-    stage.set_lights({})
-    return stage
-
-
-@lru_cache(maxsize=8)
-def _used_stage(head: HeadModel, light: Light) -> Stage:
-    """A stage that has been used once.
-
-    Kernels that meet freshly loaded numbers differ in their last digits from all later ones; the first use goes here.
-    """
-    _require_fast(load_mitsuba())
-    stage = load_stage(head, 16, 16, light, "direct")
-    stage.pose(head, head.template)
-    for _ in range(2):
-        gather_light(stage, head.template, vertex_normals(head.template, head.faces), 4, 0)
-    return stage
-
-
-def gather_light(stage: Stage, points: torch.Tensor, normals: torch.Tensor, samples: int, seed: int) -> np.ndarray:
-    """Direct light at points [N,3] with unit normals [N,3] in the scene of the stage.
-
-    All points share one low-discrepancy set of samples: the error is then smooth along the surface, not grainy.
-
-    Returns:
-        [N,6]: the radiance that a white diffuse surface would send out, then the mean direction of the light, which is
-        shorter than 1 as the light is spread.
-    """
-    mi = load_mitsuba()
-    import drjit as dr
-
-    lane = dr.arange(mi.UInt32, len(points) * samples)
-    vertex = lane // dr.opaque(mi.UInt32, samples)
-    point, normal = (
-        mi.Point3f(*(mi.Float(flat(axis)) for axis in t.numpy().T)) for t in (points + _LIFT * normals, normals)
-    )
-    set_ = mi.Point2f(*(mi.Float(flat(axis)) for axis in plane_points(samples, seed).T))
-    hit = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
-    hit.p, hit.n = dr.gather(mi.Point3f, point, vertex), mi.Normal3f(dr.gather(mi.Point3f, normal, vertex))
-    place = dr.gather(mi.Point2f, set_, lane % dr.opaque(mi.UInt32, samples))
-    sample, weight = stage.scene.sample_emitter_direction(hit, place, True)
-    cosine = dr.maximum(dr.dot(sample.d, hit.n), 0.0)
-    light = dr.select(sample.pdf > 0, weight * cosine * (dr.inv_pi / samples), 0.0)
-    brightness = mi.luminance(light)
-    values = [*light, *(brightness * sample.d), brightness]
-    dr.eval(values)  # together: each block sum alone would trace the shadow rays again
-    columns = np.stack([np.array(dr.block_sum(value, samples)) for value in values], -1)
-    return np.concatenate((columns[:, :3], columns[:, 3:6] / np.maximum(columns[:, 6:], 1e-8)), -1)
-
-
 class Shader:
     """One lit pose, ready to be seen from any camera."""
 
     def __init__(
         self,
-        stage: Stage,
+        head_scene: HeadScene,
         head: HeadModel,
         vertices: torch.Tensor,
         texture: Any,
@@ -108,10 +55,10 @@ class Shader:
         samples: int = 64,
         seed: int = 0,
     ) -> None:
-        """Put the pose on the stage and gather its light.
+        """Pose the head in the scene and gather its light.
 
         Args:
-            stage: a lit scene, from `lit_stage`; its lamps are used as they are set.
+            head_scene: a lit scene, from `lit_scene`; its lamps are used as they are set.
             head: the head model.
             vertices: [V,3] posed vertices, metres.
             texture: from `as_texture`.
@@ -124,17 +71,22 @@ class Shader:
             RuntimeError: Mitsuba cannot run its fast variant here.
         """
         mi = load_mitsuba()
-        _require_fast(mi)
+        require_fast(mi)
         import drjit as dr
 
-        stage.pose(head, vertices, None, glasses)
-        self._scene, self._texture = stage.scene, texture
+        head_scene.pose(head, vertices, None, glasses)
+        self._scene, self._texture = head_scene.scene, texture
         normals = vertex_normals(vertices, head.faces)
-        points, source, faces, texcoords = vertices, stage.mesh.source, stage.mesh.faces, stage.mesh.texcoords
-        self._shapes = [mi.ShapePtr(stage.shape("head"))]
+        points, source, faces, texcoords = (
+            vertices,
+            head_scene.mesh.source,
+            head_scene.mesh.faces,
+            head_scene.mesh.texcoords,
+        )
+        self._shapes = [mi.ShapePtr(head_scene.shape("head"))]
         self._head_faces, self._glasses_colour = len(faces), mi.Color3f(0.0)
         if glasses is not None:
-            self._shapes.append(mi.ShapePtr(stage.shape("glasses")))
+            self._shapes.append(mi.ShapePtr(head_scene.shape("glasses")))
             self._glasses_colour = mi.Color3f(*glasses.colour)
             worn, more = torch.from_numpy(glasses.points), torch.from_numpy(glasses_topology()[1].astype(np.int64))
             normals = torch.cat((normals, vertex_normals(worn, more)))
@@ -145,7 +97,7 @@ class Shader:
         self._outline = points
         # What differs between scenes and people must be data; as constants each would need a kernel of its own.
         dr.make_opaque(self._shapes, self._glasses_colour)
-        light = gather_light(stage, points, normals, samples, seed)
+        light = gather_light(head_scene, points, normals, samples, seed)
         light[:, :3] *= exposure
         corner = np.zeros((len(source), _RECORD), np.float32)
         corner[:, :11] = np.concatenate((texcoords, normals.numpy()[source], light[source]), -1)
@@ -169,11 +121,11 @@ class Shader:
 
         if not set(labels) <= set(LABELS):
             raise ValueError(f"labels must be out of {LABELS}, got {labels}")
-        (wave,) = waves([camera], self._outline)
-        layers = self._see(wave, spp, labels)
+        (launch,) = launches([camera], self._outline)
+        layers = self._see(launch, spp, labels)
         cover = layers["mask"][0]
         layers["rgb"] = [value / dr.maximum(cover, 1e-3) for value in layers["rgb"]]
-        (images,) = wave.images(layers, {"triangle": np.int64(-1)})
+        (images,) = launch.images(layers, {"triangle": np.int64(-1)})
         return images
 
     def stored_views(
@@ -192,12 +144,12 @@ class Shader:
         import drjit as dr
 
         done = 0
-        for wave in waves(cameras, self._outline):
-            behind = backdrops[done : done + len(wave.cameras)]
-            done += len(wave.cameras)
-            layers = self._see(wave, spp, ("uv", "depth", "triangle"))
+        for launch in launches(cameras, self._outline):
+            behind = backdrops[done : done + len(launch.cameras)]
+            done += len(launch.cameras)
+            layers = self._see(launch, spp, ("uv", "depth", "triangle"))
             cover = layers["mask"][0]
-            pixels = mi.UInt8(flat(wave.cut(behind)))
+            pixels = mi.UInt8(flat(launch.cut(behind)))
             place = 3 * dr.arange(mi.UInt32, dr.width(cover))
             colours = []
             for channel, value in enumerate(layers["rgb"]):
@@ -212,16 +164,16 @@ class Shader:
                 "depth": [mi.UInt32(dr.clip(layers["depth"][0] / unit + 0.5, 0, 65535))],
             }
             none = np.uint16(0)
-            for images in wave.images(stored, {"rgb": behind, "uv": none, "depth": none}):
+            for images in launch.images(stored, {"rgb": behind, "uv": none, "depth": none}):
                 yield StoredView(**images)
 
-    def _see(self, wave: Wave, spp: int, labels: Sequence[str]) -> dict[str, list[Any]]:
-        """Layers of the wave's pixels, not evaluated: "rgb" (linear, premultiplied), "mask" in [0,1] and the labels."""
+    def _see(self, launch: Launch, spp: int, labels: Sequence[str]) -> dict[str, list[Any]]:
+        """Layers of a launch's pixels, not evaluated: "rgb" (linear, premultiplied), "mask" in [0,1] and the labels."""
         mi = load_mitsuba()
         sums = [mi.Float(0)] * 4
         layers: dict[str, list[Any]] = {}
         for offset in pixel_pattern(spp):
-            ray, forward = wave.rays(offset)
+            ray, forward = launch.rays(offset)
             hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
             seen = [hit.is_valid() & (hit.shape == shape) for shape in self._shapes]
             values = self._mixed(hit, seen)
@@ -288,13 +240,8 @@ def _labels(
 def as_texture(albedo: np.ndarray, roughness: np.ndarray) -> Any:
     """A device texture of linear colour [S,S,3] and roughness [S,S], row 0 at v = 0."""
     mi = load_mitsuba()
-    _require_fast(mi)
+    require_fast(mi)
     import drjit as dr
 
     layers = np.concatenate((albedo, roughness[..., None]), -1).astype(np.float32)
     return mi.Texture2f(mi.TensorXf(aligned(layers)), wrap_mode=dr.WrapMode.Clamp)
-
-
-def _require_fast(mi: Any) -> None:
-    if mi.variant() != FAST_VARIANT:
-        raise RuntimeError(f"views with labels need Mitsuba's {FAST_VARIANT}; install LLVM 16 or newer")

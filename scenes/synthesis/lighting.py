@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.stage import Light
+from scenes.head_scene import Light
 
 _LIGHTS: tuple[Light, ...] = ("studio", "environment", "side", "portrait")
 _ODDS = (0.4, 0.35, 0.1, 0.15)
@@ -19,7 +19,7 @@ class Lighting:
     """A scene of the library with its lamps set."""
 
     light: Light
-    values: Mapping[str, np.ndarray]  # for `Stage.set_lights`
+    values: Mapping[str, np.ndarray]  # for `HeadScene.set_lights`
     brightness: float  # mean radiance of a white face that the exposure aims at
 
 

@@ -10,7 +10,7 @@ from tests.flame_files import flame_arrays
 from uika.fitting.bundle_adjustment import bundle
 from uika.fitting.frame_fit import fit_frame
 from uika.fitting.landmarks import eye_distance
-from uika.fitting.photometric import SIDE, View, follow, learn, make_appearance, place_points
+from uika.fitting.photometric import SIDE, FaceCrop, add_observation, fit_pose, make_appearance, place_points
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.head.landmark_model import FrameModel, Pose, frame_model, head_landmarks, landmark_jacobian, moved
@@ -90,22 +90,24 @@ def test_landmark_derivatives_are_exact(head: HeadModel) -> None:
     np.testing.assert_allclose(change, landmark_jacobian(model, pose)[..., 3], atol=1e-6)
 
 
-def painted(points: Array, level: Array, focal: float) -> View:
+def painted(points: Array, level: Array, focal: float) -> FaceCrop:
     """A picture in which a wavy pattern is painted at crop pixels `points`."""
     from scipy.interpolate import griddata
 
     grid = np.stack(np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5), -1)
     image = griddata(points, level, grid, fill_value=0.5).astype(np.float32)
     down, across = np.gradient(image)
-    return View(np.stack((image, across, down), -1).reshape(-1, 3), np.array([-SIDE / 2, -SIDE / 2]), 1.0)
+    return FaceCrop(np.stack((image, across, down), -1).reshape(-1, 3), np.array([-SIDE / 2, -SIDE / 2]), 1.0)
 
 
-def views_of(head: HeadModel, identity: torch.Tensor, turns: list[float]) -> tuple[dict[int, View], dict[int, Pose]]:
+def views_of(
+    head: HeadModel, identity: torch.Tensor, turns: list[float]
+) -> tuple[dict[int, FaceCrop], dict[int, Pose]]:
     """Pictures of a person with a pattern on the skin, and the poses they show."""
     model = make_appearance(head, identity, FOCAL, eye_distance(head)).model
     place = model.points[0] / 0.004
     level = 0.5 + 0.2 * np.sin(place[:, 0] * 1.1 + 0.4 * place[:, 1]) * np.cos(place[:, 1] * 0.9 - 0.3 * place[:, 2])
-    blank = View(np.zeros((SIDE * SIDE, 3), np.float32), np.array([-SIDE / 2, -SIDE / 2]), 1.0)
+    blank = FaceCrop(np.zeros((SIDE * SIDE, 3), np.float32), np.array([-SIDE / 2, -SIDE / 2]), 1.0)
     views, poses = {}, {}
     for index, turn in enumerate(turns):
         pose = replace(rest(model), rotation=FRONT @ rotation(np.array([0.05 * index, turn, 0.0])))
@@ -119,11 +121,11 @@ def views_of(head: HeadModel, identity: torch.Tensor, turns: list[float]) -> tup
 def test_colours_correct_a_wrong_guess(head: HeadModel) -> None:
     identity = person(head)
     views, poses = views_of(head, identity, [0.0, 0.1])
-    known = learn(make_appearance(head, identity, FOCAL, eye_distance(head)), poses[0], views[0])
+    known = add_observation(make_appearance(head, identity, FOCAL, eye_distance(head)), poses[0], views[0])
     wrong = replace(poses[1], rotation=rotation(np.array([0.02, -0.02, 0.01])) @ poses[1].rotation)
     P = len(known.model.free) + 6
     free = (np.zeros((P, P)), np.zeros(P))
-    found, error = follow(known, [(views[1], 12)], wrong, poses[0], free)
+    found, error = fit_pose(known, [(views[1], 12)], wrong, poses[0], free)
     assert degrees(found.rotation, poses[1].rotation) < 0.25 * degrees(wrong.rotation, poses[1].rotation)
     assert error < 0.03
 

@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 import scenes
-from scenes.stage import load_stage
+from scenes.head_scene import load_head_scene
 from tests.heads import sphere_head
 from uika.head import Camera, HeadModel, look_at
 
@@ -30,8 +30,8 @@ def pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("sizes", [(7, 9), (24, 32)])
 def test_areas_agree(sizes: tuple[int, int]) -> None:
     head = sphere_head(*sizes)
-    stage = load_stage(head, 16, 16, "flat", "direct")
-    (shape,) = (shape for shape in stage.scene.shapes() if shape.id() == "head")
+    head_scene = load_head_scene(head, 16, 16, "flat", "direct")
+    (shape,) = (shape for shape in head_scene.scene.shapes() if shape.id() == "head")
     mesh = mesh_of(head)
     assert float(np.array(shape.surface_area()).item()) == pytest.approx(mesh.area, rel=AREA)
 

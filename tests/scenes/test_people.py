@@ -9,8 +9,9 @@ import scenes
 from scenes.people import GlassesStyle, paint, sample_person, wear_glasses
 from scenes.people.hair import hair_offsets
 from scenes.people.person import CUTS
-from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+from scenes.synthesis.deferred import Shader, as_texture
 from scenes.synthesis.lighting import backdrop, sample_lighting
+from scenes.synthesis.vertex_light import lit_scene
 from tests.heads import sphere_head
 from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_vertices
 
@@ -70,8 +71,8 @@ def test_fast_views_agree_with_mitsubas_integrator(face: HeadModel) -> None:
     srgb = scenes.linear_to_srgb(albedo)
     texture = as_texture(albedo, rough)
     for light, limit in (("studio", 0.06), ("environment", 0.04), ("side", 0.03)):
-        stage = lit_stage(face, light)  # type: ignore[arg-type]
-        seen = Shader(stage, face, face.template, texture).view(CAMERA, 4, ("uv", "depth", "normal", "triangle"))
+        head_scene = lit_scene(face, light)  # type: ignore[arg-type]
+        seen = Shader(head_scene, face, face.template, texture).view(CAMERA, 4, ("uv", "depth", "normal", "triangle"))
         names = ("rgb", "mask", "uv", "depth", "triangle")
         truth = scenes.render(face.template, face, CAMERA, srgb, names, 64, light, roughness=rough)  # type: ignore[arg-type]
         # The two aim their rays with different rounding: one that grazes an edge may hit its other side.
@@ -96,9 +97,9 @@ def test_glasses_hide_the_face_and_follow_the_head(face: HeadModel) -> None:
     np.testing.assert_allclose(*sizes, atol=1e-5)
     assert np.abs(glasses.points - rest.points).max() > 0.01
     texture = as_texture(np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2), 0.5, np.float32))
-    stage = lit_stage(face, "studio")
-    bare = Shader(stage, face, vertices, texture).view(CAMERA, 4, ("triangle",))
-    worn = Shader(stage, face, vertices, texture, glasses).view(CAMERA, 4, ("triangle",))
+    head_scene = lit_scene(face, "studio")
+    bare = Shader(head_scene, face, vertices, texture).view(CAMERA, 4, ("triangle",))
+    worn = Shader(head_scene, face, vertices, texture, glasses).view(CAMERA, 4, ("triangle",))
     hidden = (bare["triangle"] >= 0) & (worn["triangle"] < 0)
     assert 10 < hidden.sum() < 0.2 * (bare["triangle"] >= 0).sum()
     assert (worn["mask"][hidden] > 0).all()
@@ -107,10 +108,10 @@ def test_glasses_hide_the_face_and_follow_the_head(face: HeadModel) -> None:
 
 def test_a_pose_does_not_depend_on_what_stood_there_before(face: HeadModel) -> None:
     texture = as_texture(np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2), 0.5, np.float32))
-    stage = lit_stage(face, "environment")
-    first = Shader(stage, face, face.template, texture).view(CAMERA, 4)["rgb"]
-    Shader(stage, face, face.template * 1.5 + 0.01, texture)
-    np.testing.assert_array_equal(Shader(stage, face, face.template, texture).view(CAMERA, 4)["rgb"], first)
+    head_scene = lit_scene(face, "environment")
+    first = Shader(head_scene, face, face.template, texture).view(CAMERA, 4)["rgb"]
+    Shader(head_scene, face, face.template * 1.5 + 0.01, texture)
+    np.testing.assert_array_equal(Shader(head_scene, face, face.template, texture).view(CAMERA, 4)["rgb"], first)
 
 
 def test_lights_and_backdrops_are_seeded(face: HeadModel) -> None:
@@ -118,21 +119,21 @@ def test_lights_and_backdrops_are_seeded(face: HeadModel) -> None:
         one, same = (sample_lighting(np.random.default_rng(seed)) for _ in range(2))
         assert one.light == same.light and one.values.keys() == same.values.keys()
         assert all(np.array_equal(value, same.values[name]) for name, value in one.values.items())
-        stage = lit_stage(face, one.light)
-        stage.set_lights(one.values)
+        head_scene = lit_scene(face, one.light)
+        head_scene.set_lights(one.values)
         picture = backdrop(np.random.default_rng(seed), 32)
         assert picture.shape == (32, 32, 3) and picture.min() >= 0 and picture.max() <= 1
     with pytest.raises(ValueError, match="no parameter 'moon'"):
-        lit_stage(face, "side").set_lights({"moon": np.zeros(3)})
+        lit_scene(face, "side").set_lights({"moon": np.zeros(3)})
 
 
 def test_changed_lamps_do_not_outlive_their_use(face: HeadModel) -> None:
     def view() -> np.ndarray:
-        stage = lit_stage(face, "studio")
+        head_scene = lit_scene(face, "studio")
         texture = as_texture(np.full((2, 2, 3), 0.5, np.float32), np.full((2, 2), 0.5, np.float32))
-        return Shader(stage, face, face.template, texture).view(CAMERA, 1, ())["rgb"]
+        return Shader(head_scene, face, face.template, texture).view(CAMERA, 1, ())["rgb"]
 
     before = view()
-    stage = lit_stage(face, "studio")
-    stage.set_lights({"key.emitter.radiance.value": np.array([90.0, 10.0, 10.0], np.float32)})
+    head_scene = lit_scene(face, "studio")
+    head_scene.set_lights({"key.emitter.radiance.value": np.array([90.0, 10.0, 10.0], np.float32)})
     np.testing.assert_array_equal(view(), before)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import scenes
-from scenes.stage import load_stage
+from scenes.head_scene import load_head_scene
 from tests.heads import sphere_head
 from uika.head import Camera, HeadModel, HeadParameters, look_at, pose_vertices, project, rasterize
 
@@ -119,10 +119,10 @@ def test_repeated_renders_load_nothing_and_keep_no_memory(head: HeadModel, camer
         return int(Path("/proc/self/statm").read_text().split()[1])
 
     frames(3)
-    loads = load_stage.cache_info().misses
+    loads = load_head_scene.cache_info().misses
     before = resident_pages()
     frames(12)
-    assert load_stage.cache_info().misses == loads
+    assert load_head_scene.cache_info().misses == loads
     assert (resident_pages() - before) * os.sysconf("SC_PAGE_SIZE") < 20e6
 
 

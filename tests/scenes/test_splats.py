@@ -8,7 +8,7 @@ import torch
 import scenes
 from drjit_splat import rasterization
 from scenes.colour import srgb_to_linear
-from scenes.stage import load_stage
+from scenes.head_scene import load_head_scene
 from tests.heads import sphere_head
 from uika.avatar import Avatar
 from uika.head import look_at
@@ -148,5 +148,5 @@ def test_a_missing_avatar_is_named(tmp_path: Path) -> None:
 
 
 def test_the_head_stands_among_other_scenes() -> None:
-    stage = load_stage(sphere_head(), 16, 16, "studio", "direct")
-    assert stage.shape("head") is not None and stage.shape("nobody") is None
+    head_scene = load_head_scene(sphere_head(), 16, 16, "studio", "direct")
+    assert head_scene.shape("head") is not None and head_scene.shape("nobody") is None

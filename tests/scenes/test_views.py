@@ -36,11 +36,12 @@ def test_lamps_of_every_seed_can_be_drawn() -> None:
 
 
 def test_stored_views_are_the_single_views_rounded() -> None:
-    from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+    from scenes.synthesis.deferred import Shader, as_texture
+    from scenes.synthesis.vertex_light import lit_scene
 
     head = sphere_head()
     texture = as_texture(np.random.default_rng(0).random((16, 16, 3)), np.full((16, 16), 0.5))
-    shader = Shader(lit_stage(head, "studio"), head, head.template, texture)
+    shader = Shader(lit_scene(head, "studio"), head, head.template, texture)
     cameras = [look_at(yaw, distance=0.8, fov_y=20, size=40) for yaw in (-30, 0, 50)]
     away = look_at(0, distance=0.8, fov_y=20, size=40)
     cameras.append(Camera(away.viewmat, away.K + torch.tensor([[0, 0, 400.0], [0, 0, 0], [0, 0, 0]]), 40, 40))

@@ -37,20 +37,21 @@ def generate_identity(
     """
     from scenes.people import paint, sample_person, wear_glasses
     from scenes.people.hair import hair_offsets
-    from scenes.synthesis.deferred import Shader, as_texture, lit_stage
+    from scenes.synthesis.deferred import Shader, as_texture
     from scenes.synthesis.lighting import backdrop, sample_lighting
+    from scenes.synthesis.vertex_light import lit_scene
 
     person = sample_person(int(_random(seed, identity, "person").integers(2**31)), head)
     lighting = sample_lighting(_random(seed, identity, "light"))
-    stage = lit_stage(head, lighting.light)
-    stage.set_lights(lighting.values)
+    head_scene = lit_scene(head, lighting.light)
+    head_scene.set_lights(lighting.values)
     texture = as_texture(*paint(person, head, texture_size(size)))
     offset = hair_offsets(person, head)
     params = perform(head, person.shape, frames, _random(seed, identity, "motion"))
     bare = shaped_vertices(head, HeadParameters.zeros(head).replace(identity=person.shape))
     # The same light samples for all frames: others would make the picture flicker.
     samples = int(_random(seed, identity, "samples").integers(2**31))
-    exposure = lighting.brightness / _face_radiance(stage, head, bare + offset, samples)
+    exposure = lighting.brightness / _face_radiance(head_scene, head, bare + offset, samples)
     cameras = [
         place_camera(view, size, _random(seed, identity, "camera", index))
         for index, view in enumerate(viewpoints(views))
@@ -67,7 +68,7 @@ def generate_identity(
             yield f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))
             glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
             shader = Shader(
-                stage,
+                head_scene,
                 head,
                 posed[frame],
                 texture,
@@ -110,14 +111,14 @@ def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.
     return np.random.default_rng([seed, identity, _STREAMS[stream], index])
 
 
-def _face_radiance(stage: Any, head: HeadModel, vertices: torch.Tensor, seed: int) -> float:
+def _face_radiance(head_scene: Any, head: HeadModel, vertices: torch.Tensor, seed: int) -> float:
     """Mean radiance of a white, resting face."""
-    from scenes.synthesis.deferred import gather_light
+    from scenes.synthesis.vertex_light import gather_light
 
-    stage.pose(head, vertices)
+    head_scene.pose(head, vertices)
     face = (head.masks["face"] > 0.5).nonzero()[:, 0]
     normals = vertex_normals(vertices, head.faces)
-    light = gather_light(stage, vertices[face], normals[face], _LIGHT_SAMPLES[1], seed)[:, :3]
+    light = gather_light(head_scene, vertices[face], normals[face], _LIGHT_SAMPLES[1], seed)[:, :3]
     return max(float(light.mean()), 1e-4)
 
 

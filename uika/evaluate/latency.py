@@ -205,7 +205,7 @@ def _peak_gib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def stir(model: Reconstructor, seed: int = 0) -> None:
+def perturb_weights(model: Reconstructor, seed: int = 0) -> None:
     """Add noise to every matrix, so that layers which start at zero take part as after a training."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -263,7 +263,7 @@ def _networks(preset: str, model: str | Path | None, estimator: bool) -> tuple[R
     if model is not None:
         return load_checkpoint(model), None
     network = build(preset).eval()
-    stir(network)
+    perturb_weights(network)
     torch.manual_seed(0)
     return network, Estimator(ESTIMATORS[preset]).eval() if estimator else None
 

@@ -20,7 +20,7 @@ from uika.fitting.photometric import (
     CORRELATED,
     LIGHT_PRIOR,
     Appearance,
-    View,
+    FaceCrop,
     along_surface,
     place_points,
     point_trust,
@@ -54,7 +54,7 @@ def bundle(
     person: Appearance,
     model: FrameModel,
     poses: Mapping[int, Pose],
-    views: Mapping[int, View],
+    views: Mapping[int, FaceCrop],
     targets: Mapping[int, Array],
     pull: float,
     focal_spread: float = FOCAL_SPREAD,
@@ -108,7 +108,7 @@ class _Rows:
 
 
 def _rows(
-    model: FrameModel, modes: NDArray[np.float32], state: Bundle, views: Mapping[int, View], frames: Sequence[int]
+    model: FrameModel, modes: NDArray[np.float32], state: Bundle, views: Mapping[int, FaceCrop], frames: Sequence[int]
 ) -> _Rows:
     offset = np.asarray(modes @ state.offset, dtype=np.float64).T
     current = replace(shifted(model, offset), focal=state.focal)

@@ -50,7 +50,7 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class View:
+class FaceCrop:
     """A square of a frame at the compared size: grey level and its slopes along x and y, [SIDE*SIDE,3]."""
 
     pixels: NDArray[np.float32]
@@ -89,7 +89,7 @@ def _in_front(head: HeadModel) -> torch.Tensor:
     return seen
 
 
-def face_view(grey: NDArray[np.uint8], landmarks: Array, centre: Array, blur: float) -> View:
+def crop_face(grey: NDArray[np.uint8], landmarks: Array, centre: Array, blur: float) -> FaceCrop:
     """Cut the face out of a frame.
 
     Args:
@@ -107,11 +107,11 @@ def face_view(grey: NDArray[np.uint8], landmarks: Array, centre: Array, blur: fl
     image = Image.fromarray(grey).transform((SIDE, SIDE), Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR)
     level = np.asarray(image.filter(ImageFilter.GaussianBlur(blur)), dtype=np.float32) / 255
     down, across = np.gradient(level)
-    return View(np.stack((level, across, down), -1).reshape(-1, 3), corner - centre, 1 / step)
+    return FaceCrop(np.stack((level, across, down), -1).reshape(-1, 3), corner - centre, 1 / step)
 
 
-def learn(appearance: Appearance, pose: Pose, view: View) -> Appearance:
-    """Remember what a frame shows at the points."""
+def add_observation(appearance: Appearance, pose: Pose, view: FaceCrop) -> Appearance:
+    """Add what a frame shows at the points to the mean grey levels, by trust."""
     place, camera = place_points(appearance.model, pose, view)
     trust = point_trust(appearance.model, pose, camera)
     total = appearance.seen + trust
@@ -119,8 +119,8 @@ def learn(appearance: Appearance, pose: Pose, view: View) -> Appearance:
     return replace(appearance, level=level / np.maximum(total, 1e-9), seen=total)
 
 
-def follow(
-    appearance: Appearance, views: list[tuple[View, int]], guess: Pose, before: Pose, anchor: tuple[Array, Array]
+def fit_pose(
+    appearance: Appearance, views: list[tuple[FaceCrop, int]], guess: Pose, before: Pose, anchor: tuple[Array, Array]
 ) -> tuple[Pose, float]:
     """Fit a frame to the appearance.
 
@@ -166,7 +166,7 @@ def along_surface(model: FrameModel, pose: Pose, slope: NDArray[np.float32], out
         out += slope[:, axis : axis + 1] * jacobian[:, axis]
 
 
-def place_points(model: FrameModel, pose: Pose, view: View) -> tuple[Array, Array]:
+def place_points(model: FrameModel, pose: Pose, view: FaceCrop) -> tuple[Array, Array]:
     """Crop pixels [M,2] and camera-space points [M,3]."""
     camera = head_landmarks(model, pose) @ pose.rotation.T + pose.translation
     pixels = model.focal * camera[:, :2] / np.maximum(camera[:, 2:], 1e-6)
@@ -179,7 +179,7 @@ def point_trust(model: FrameModel, pose: Pose, camera: Array) -> Array:
     return ((cosine - POINT_VISIBLE) / (POINT_FACING - POINT_VISIBLE)).clip(0, 1)
 
 
-def sample(view: View, place: Array) -> Array:
+def sample(view: FaceCrop, place: Array) -> Array:
     """Bilinear level and slopes [M,3] at crop pixels [M,2], centres at +0.5; the border repeats."""
     at = (place - 0.5).clip(0, SIDE - 1.001)
     cell = at.astype(np.int64)
@@ -194,7 +194,7 @@ def _system(
     appearance: Appearance,
     pose: Pose,
     light: Array,
-    view: View,
+    view: FaceCrop,
     before: Pose,
     anchor: tuple[Array, Array],
     travelled: Array,

@@ -13,7 +13,7 @@ from uika.fitting.bundle_adjustment import bundle
 from uika.fitting.frame_fit import landmark_pull
 from uika.fitting.landmark_prior import landmark_trust
 from uika.fitting.landmarks import LandmarkFit, eye_distance
-from uika.fitting.photometric import View, face_view, follow, learn, make_appearance
+from uika.fitting.photometric import FaceCrop, add_observation, crop_face, fit_pose, make_appearance
 from uika.head import HeadModel
 from uika.head.axis_angle import Array
 from uika.head.landmark_model import Pose, frame_model
@@ -57,14 +57,14 @@ def refine_landmark_fit(
     if len(images) < 2 or model.joints:
         return fit, None
     person = make_appearance(head, fit.identity, nominal, unit)
-    views: dict[int, View] = {}
+    views: dict[int, FaceCrop] = {}
     targets: dict[int, Array] = {}
     poses: dict[int, Pose] = {}
     for n, image in enumerate(images):
         grey = (torch.einsum("chw,c->hw", image, image.new_tensor(_LUMA)) * 255).round().byte().numpy()
         marks, centre = landmarks[n].double().numpy(), np.array([image.shape[2], image.shape[1]]) / 2
         scale = nominal / float(fit.focal[n])
-        view = face_view(grey, marks, centre, BLUR)
+        view = crop_face(grey, marks, centre, BLUR)
         views[n] = replace(view, corner=view.corner * scale, scale=view.scale / scale)
         targets[n] = (marks - centre) * scale
         expression = fit.expression[n].numpy()
@@ -76,12 +76,12 @@ def refine_landmark_fit(
         )
     trust = landmark_trust(model, poses, targets)
     first = min(poses, key=lambda n: float(np.abs(poses[n].rotation[2, :2]).sum()))
-    person = learn(person, poses[first], views[first])
+    person = add_observation(person, poses[first], views[first])
     for n in sorted(poses, key=lambda n: float(np.linalg.norm(poses[n].rotation - poses[first].rotation))):
         matrix, gradient = landmark_pull(model, poses[n], targets[n])
         pull = (trust * matrix, trust * gradient)
-        poses[n], _ = follow(person, [(views[n], FOLLOW_STEPS)], poses[n], poses[n], pull)
-        person = learn(person, poses[n], views[n])
+        poses[n], _ = fit_pose(person, [(views[n], FOLLOW_STEPS)], poses[n], poses[n], pull)
+        person = add_observation(person, poses[n], views[n])
     found = bundle(head, person, model, poses, views, targets, trust, focal_spread=1e-3)
     identity = fit.identity.clone()
     identity[: len(found.offset)] += torch.from_numpy(found.offset)

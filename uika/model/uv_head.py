@@ -34,7 +34,7 @@ def grid_positions(rows: int, columns: int, channels: int, aspect: float, device
 
 
 class UvHead(nn.Module):
-    """Dense prediction head; its last channel, a confidence, is computed by nobody's request and not returned."""
+    """Dense prediction head; its last channel, a confidence, is not returned."""
 
     def __init__(self, config: EstimatorConfig) -> None:
         """See `EstimatorConfig`."""

@@ -15,14 +15,14 @@ from torch import Tensor
 from uika.fitting.bundle_adjustment import bundle
 from uika.fitting.frame_fit import fit_frame, start_pose
 from uika.fitting.landmarks import LandmarkFit, eye_distance, fit_landmarks
-from uika.fitting.photometric import View, face_view, learn, make_appearance
+from uika.fitting.photometric import FaceCrop, add_observation, crop_face, make_appearance
 from uika.head import HeadModel, load_head
 from uika.head.axis_angle import Array
 from uika.head.landmark_model import FrameModel, Pose, frame_model
 from uika.io.progress import counted
 from uika.motion import Motion
 from uika.motion.smoothing import smoothed
-from uika.tracking.colours import BLURS, LANDMARK_PULL, follow_person, learn_person
+from uika.tracking.appearance import BLURS, LANDMARK_PULL, learn_appearance, track_appearance
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate
 from uika.tracking.poses import poses_to_motion, without_gaps
 
@@ -53,7 +53,7 @@ class Track:
 @dataclass(frozen=True)
 class _Seen:
     landmarks: list[Array | None]
-    keys: dict[int, View]  # sharp views of some frames
+    keys: dict[int, FaceCrop]  # sharp views of some frames
     fps: float
     size: tuple[int, int]
 
@@ -91,18 +91,18 @@ def track_video(
     start = time.perf_counter()
     blank = make_appearance(head, fit.identity, focal, unit)
     known = {index: rough[index] for index in seen.keys}
-    person, known = learn_person(blank, model, known, targets, seen.keys)
+    person, known = learn_appearance(blank, model, known, targets, seen.keys)
     shared = bundle(head, person, model, known, seen.keys, targets, LANDMARK_PULL)
     identity = fit.identity.clone()
     identity[: len(shared.offset)] += torch.from_numpy(shared.offset)
     model = frame_model(head, identity, shared.focal, unit)
     person = make_appearance(head, identity, shared.focal, unit)
     for index, pose in shared.poses.items():
-        person = learn(person, pose, seen.keys[index])
+        person = add_observation(person, pose, seen.keys[index])
     seconds["identity"] = time.perf_counter() - start
     start = time.perf_counter()
     frames = counted(decode_ahead(Path(path)), progress, len(seen.landmarks), "follow")
-    poses = follow_person(person, model, rough, targets, (grey for grey, _ in frames), centre)
+    poses = track_appearance(person, model, rough, targets, (grey for grey, _ in frames), centre)
     seconds["follow"] = time.perf_counter() - start
     complete = without_gaps(poses, len(seen.landmarks))
     motion = poses_to_motion(complete, model, head, identity, seen.fps)
@@ -123,7 +123,7 @@ def _look(path: Path, progress: bool) -> _Seen:
     from uika.photo.networks import follow_meshes
 
     landmarks: list[Array | None] = []
-    keys: dict[int, View] = {}
+    keys: dict[int, FaceCrop] = {}
     greys: list[NDArray[np.uint8]] = []
     stride, size = 1, (0, 0)
 
@@ -138,7 +138,7 @@ def _look(path: Path, progress: bool) -> _Seen:
         size = (image.shape[1], image.shape[0])
         landmarks.append(marks)
         if marks is not None and index % stride == 0:
-            keys[index] = face_view(greys[0], marks, np.array(size) / 2, BLURS[-1][0])
+            keys[index] = crop_face(greys[0], marks, np.array(size) / 2, BLURS[-1][0])
         if len(keys) >= 2 * KEY_FRAMES - 8:
             stride *= 2
             keys = {index: view for index, view in keys.items() if index % stride == 0}

@@ -181,7 +181,7 @@ class _Trainer:
         outputs: list[tuple[Tensor, ...]],
         skip: bool,
     ) -> None:
-        """Keep the books; stop a training that has gone astray."""
+        """Record the step; stop after too many steps in a row whose numbers were not finite."""
         step, seconds = progress.step, self._clock.take()
         self._failures = self._failures + 1 if skip else 0
         if skip:

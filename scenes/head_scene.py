@@ -31,7 +31,7 @@ _SKY = ((0.95, 1.0, 1.1), (0.35, 0.33, 0.3))  # linear radiance at the zenith an
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class HeadScene:
     """A scene file loaded for one head and image size."""
 
     scene: Any
@@ -136,7 +136,7 @@ class Stage:
 
 
 @lru_cache(maxsize=8)
-def load_stage(head: HeadModel, width: int, height: int, light: Light, integrator: str) -> Stage:
+def load_head_scene(head: HeadModel, width: int, height: int, light: Light, integrator: str) -> HeadScene:
     """Load a scene file once for each head, image size, light and integrator.
 
     Raises:
@@ -168,7 +168,7 @@ def load_stage(head: HeadModel, width: int, height: int, light: Light, integrato
             integrator=integrator,
             **{key: str(path) for key, path in files.items()},
         )
-    return Stage(scene, mi.traverse(scene), mesh, light)
+    return HeadScene(scene, mi.traverse(scene), mesh, light)
 
 
 def plain_sky(height: int = 32) -> np.ndarray:

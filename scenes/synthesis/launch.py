@@ -20,7 +20,7 @@ Box = tuple[int, int, int, int]  # x0, y0, width, height in pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Wave:
+class Launch:
     """The pixels of the boxes of some cameras, camera after camera, row after row."""
 
     cameras: tuple[Camera, ...]
@@ -83,19 +83,19 @@ class Wave:
         return result
 
 
-def waves(cameras: Sequence[Camera], subject: torch.Tensor) -> Iterator[Wave]:
+def launches(cameras: Sequence[Camera], subject: torch.Tensor) -> Iterator[Launch]:
     """Split cameras into launches; pixels from which no ray meets the convex hull of `subject` [V,3] get no lane."""
     boxes = [_box(camera, subject) for camera in cameras]
     start = lanes = 0
     for index, (_, _, width, height) in enumerate(boxes):
         if lanes and lanes + width * height > _MOST_LANES:
-            yield _wave(cameras[start:index], boxes[start:index])
+            yield _launch(cameras[start:index], boxes[start:index])
             start, lanes = index, 0
         lanes += width * height
-    yield _wave(cameras[start:], boxes[start:])
+    yield _launch(cameras[start:], boxes[start:])
 
 
-def _wave(cameras: Sequence[Camera], boxes: Sequence[Box]) -> Wave:
+def _launch(cameras: Sequence[Camera], boxes: Sequence[Box]) -> Launch:
     mi = load_mitsuba()
     import drjit as dr
     from drjit.llvm.ad import ArrayXf
@@ -110,7 +110,7 @@ def _wave(cameras: Sequence[Camera], boxes: Sequence[Box]) -> Wave:
     across = dr.maximum(dr.gather(mi.UInt32, width, view), 1)
     table = mi.Float(flat(np.stack([_table(camera) for camera in cameras])))
     numbers = dr.gather(ArrayXf, table, view, shape=(16, len(owner)))
-    return Wave(
+    return Launch(
         tuple(cameras),
         tuple(boxes),
         dr.gather(mi.UInt32, x0, view) + lane % across,

@@ -13,7 +13,7 @@ from uika.head import HeadModel, uv_texels
 _REACH = 6  # texels beyond the edges of the charts
 
 
-def bleed(values: Tensor, head: HeadModel, size: int) -> Tensor:
+def dilate(values: Tensor, head: HeadModel, size: int) -> Tensor:
     """Fill the texels around the charts of an atlas map [C,S,S] with means of their neighbours, ring after ring."""
     flat = values.reshape(len(values), -1).clone()
     for texel, neighbour, weight in _rings(head, size):

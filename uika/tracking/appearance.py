@@ -1,4 +1,4 @@
-"""Learn a person's colours from key frames of a video, then follow them through all frames."""
+"""The person's appearance, learned from key frames of a video, then fitted to all frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.fitting.frame_fit import landmark_pull
-from uika.fitting.photometric import Appearance, View, face_view, follow, learn
+from uika.fitting.photometric import Appearance, FaceCrop, add_observation, crop_face, fit_pose
 from uika.head.axis_angle import Array
 from uika.head.landmark_model import FrameModel, Pose
 
@@ -18,8 +18,8 @@ LANDMARK_PULL = 0.01  # landmarks only keep the colours from getting lost: their
 FIRST_STEPS, SECOND_STEPS = 8, 6  # for key frames
 
 
-def learn_person(
-    blank: Appearance, model: FrameModel, rough: dict[int, Pose], targets: dict[int, Array], keys: dict[int, View]
+def learn_appearance(
+    blank: Appearance, model: FrameModel, rough: dict[int, Pose], targets: dict[int, Array], keys: dict[int, FaceCrop]
 ) -> tuple[Appearance, dict[int, Pose]]:
     """The person's colours: from the calmest frontal key frame first, then from all, each fitted to what is known.
 
@@ -31,17 +31,17 @@ def learn_person(
     turned = np.degrees(np.arccos(np.array([-rough[index].rotation[2, 2] for index in keys]).clip(-1, 1)))
     first = list(keys)[int(np.argmin(turned / 10 + odd))]
     order = sorted(keys, key=lambda index: float(np.linalg.norm(rough[index].rotation - rough[first].rotation)))
-    person = learn(blank, rough[first], keys[first])
+    person = add_observation(blank, rough[first], keys[first])
     poses: dict[int, Pose] = {}
     for index in order:
         pull = _pull(model, rough[index], targets[index])
-        poses[index], _ = follow(person, [(keys[index], FIRST_STEPS)], rough[index], rough[first], pull)
-        person = learn(person, poses[index], keys[index])
+        poses[index], _ = fit_pose(person, [(keys[index], FIRST_STEPS)], rough[index], rough[first], pull)
+        person = add_observation(person, poses[index], keys[index])
     renewed = blank
     for index in order:
         pull = _pull(model, poses[index], targets[index])
-        poses[index], _ = follow(person, [(keys[index], SECOND_STEPS)], poses[index], poses[index], pull)
-        renewed = learn(renewed, poses[index], keys[index])
+        poses[index], _ = fit_pose(person, [(keys[index], SECOND_STEPS)], poses[index], poses[index], pull)
+        renewed = add_observation(renewed, poses[index], keys[index])
     return renewed, poses
 
 
@@ -50,7 +50,7 @@ def _pull(model: FrameModel, pose: Pose, target: Array) -> tuple[Array, Array]:
     return LANDMARK_PULL * matrix, LANDMARK_PULL * gradient
 
 
-def follow_person(
+def track_appearance(
     person: Appearance,
     model: FrameModel,
     rough: dict[int, Pose],
@@ -73,7 +73,7 @@ def follow_person(
         if index not in targets:
             continue
         marks = targets[index] + centre
-        views = [(face_view(grey, marks, centre, blur), steps) for blur, steps in BLURS]
+        views = [(crop_face(grey, marks, centre, blur), steps) for blur, steps in BLURS]
         guess = before = rough[index]
         if index - 1 in poses:
             # The landmarks' errors cancel in their change from frame to frame.
@@ -81,5 +81,5 @@ def follow_person(
             turn = rough[index].rotation @ was.rotation.T
             shift = rough[index].translation - was.translation
             guess = replace(before, rotation=turn @ before.rotation, translation=before.translation + shift)
-        poses[index], _ = follow(person, views, guess, before, _pull(model, guess, targets[index]))
+        poses[index], _ = fit_pose(person, views, guess, before, _pull(model, guess, targets[index]))
     return poses
