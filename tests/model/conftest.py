@@ -47,6 +47,7 @@ def make_inputs() -> Callable[..., Inputs]:
             mirror=torch.arange(map_size**2).reshape(map_size, map_size).flip(1),
             lift=0.05 * torch.rand(1, map_size, map_size, generator=generator),
             shape=0.02 * torch.randn(3, map_size, map_size, generator=generator),
+            face=torch.linspace(-0.5, 1.5, map_size).clamp(0, 1).expand(1, map_size, map_size),
         )
         return {
             "images": torch.rand(batch, views, 3, side, side, generator=generator),

@@ -34,6 +34,7 @@ def test_unknown_and_missing_fields_are_named() -> None:
         ("outputs", (1, 2, 3, 3)),
         ("token_grid", 31),
         ("fusion", "sum"),
+        ("scope", "hair"),
     ],
 )
 def test_impossible_values_are_refused(field: str, value: object) -> None:

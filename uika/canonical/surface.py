@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from uika.canonical.regions import regions
+from uika.canonical.regions import mask_at_texels, regions
 from uika.head import (
     Binding,
     HeadModel,
@@ -41,6 +41,7 @@ class SurfaceTexels:
     regions [S,S] int64 labels of parts whose colours do not mix (skin, eyeballs, teeth), or None
     lift    [1,S,S] metres by which hair stands off the bald head, 0 elsewhere, or None
     shape   [3,S,S] metres from the mean bald head to the surface, 0 elsewhere, or None
+    face    [1,S,S] how far each texel belongs to the face, in [0,1], 0 elsewhere, or None
     prior   [3,S,S] colours for texels that neither a photo nor its mirror image shows, NaN where there is none, or None
     """
 
@@ -52,6 +53,7 @@ class SurfaceTexels:
     prior: Tensor | None = None
     lift: Tensor | None = None
     shape: Tensor | None = None
+    face: Tensor | None = None
 
     def rows(self, first: int, last: int) -> SurfaceTexels:
         """The texels from `first` to before `last`; the maps stay whole."""
@@ -88,7 +90,9 @@ def surface_texels(
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     deviation = (vertices - head.template)[head.faces[binding.triangle]] * binding.barycentric[..., None]
     shape = binding.to_map(deviation.sum(1))
-    return replace(surface, lift=_lift(head, neutral, static_offset, binding), shape=shape), binding
+    face = binding.to_map(mask_at_texels(head, binding, "face")[:, None]) if "face" in head.masks else None
+    lift = _lift(head, neutral, static_offset, binding)
+    return replace(surface, lift=lift, shape=shape, face=face), binding
 
 
 def _at_seam(binding: Binding) -> Tensor:

@@ -108,6 +108,8 @@ class ModelConfig:
     detail            share of the completed observation's fine relief of colours that predicted colours take over; a
                       network that is trained on mean errors paints smooth; not in the paper
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
+    scope             "all", or "face_colors": what is predicted counts for the colours of the face alone, everything
+                      else stays the surface with its completed observation; for weights that lose elsewhere
     """
 
     name: str
@@ -130,6 +132,7 @@ class ModelConfig:
     palette: int = 0
     detail: float = 0.0
     fusion: Literal["learned", "fixed"] = "learned"
+    scope: Literal["all", "face_colors"] = "all"
 
     def __post_init__(self) -> None:
         """Refuse combinations that cannot be built, naming the field."""
@@ -145,6 +148,7 @@ class ModelConfig:
             (max(self.outputs) == self.layers, "the last of outputs must be layers"),
             (self.token_grid % 2 == 0, "token_grid must be even"),
             (self.fusion in ("learned", "fixed"), 'fusion must be "learned" or "fixed"'),
+            (self.scope in ("all", "face_colors"), 'scope must be "all" or "face_colors"'),
             (0 <= self.palette <= 64, "palette must lie in 0..64"),
             (0 <= self.detail <= 1, "detail must lie in [0,1]"),
             (0 <= self.gaussians.least_scale <= 1, "gaussians.least_scale must lie in [0,1]"),

@@ -25,6 +25,7 @@ class GaussianDecoder(nn.Module):
         self.map_size = config.map_size
         self.aggregation, self.surface = config.aggregation, config.surface
         self.detail = config.detail if config.aggregation else 0.0
+        self.scope, self.init_opacity = config.scope, config.gaussians.init_opacity
         self.dpt_decoder = UvDpt(config)
         self.mlp_net = TexelMlp(config.dpt_features, config.mlp_width)
         self.gs_net = AttributeHeads(config)
@@ -50,11 +51,24 @@ class GaussianDecoder(nn.Module):
                 inner = self.mlp_net(features[:, rows].to(seen.dtype))
                 parts.append(self.gs_net(inner, seen[:, rows], surface.rows(first, first + _TEXELS), palette))
         result = Attributes(*(torch.cat(values, dim=1) for values in zip(*parts, strict=True)))
-        if not self.detail:
-            return result
-        relief = _gather(_fine(observed[:, :3], texel), texel)
-        colors = result.colors + self.detail * result.fusion_weight[..., None] * relief
-        return result._replace(colors=colors.clamp(0, 1))
+        if self.detail:
+            relief = _gather(_fine(observed[:, :3], texel), texel)
+            colors = result.colors + self.detail * result.fusion_weight[..., None] * relief
+            result = result._replace(colors=colors.clamp(0, 1))
+        return result if self.scope == "all" else self._face_colors(result, seen[..., :3], texel, surface)
+
+    def _face_colors(self, result: Attributes, seen: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
+        """The surface in the colours of the observation [B,M,3], predicted ones on the face alone."""
+        assert surface.face is not None
+        face = _gather(surface.face[None], texel)
+        return Attributes(
+            offsets=torch.zeros_like(result.offsets),
+            quats=surface.quats.expand_as(result.quats),
+            scales=surface.scales.expand_as(result.scales),
+            opacities=torch.full_like(result.opacities, self.init_opacity),
+            colors=torch.lerp(seen, result.colors, face),
+            fusion_weight=result.fusion_weight * face[..., 0],
+        )
 
 
 def _fine(color: Tensor, texel: Tensor) -> Tensor:

@@ -221,9 +221,10 @@ class Reconstructor(nn.Module):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
-        for name in ("lift", "shape") if self.config.surface else ():
-            if getattr(surface, name) is None:
-                raise ValueError(f"surface.{name} is missing, which a model with config.surface needs")
+        needed = {"lift": self.config.surface, "shape": self.config.surface, "face": self.config.scope != "all"}
+        for name, wanted in needed.items():
+            if wanted and getattr(surface, name) is None:
+                raise ValueError(f"surface.{name} is missing, which a model with this config needs")
         size = self.config.map_size
         if len(texel) and (int(texel.min()) < 0 or int(texel.max()) >= size * size):
             raise ValueError(f"texel must index an atlas of {size}x{size} texels (config.map_size)")

@@ -1,0 +1,43 @@
+"""What weights may change that are worth something for the colours of the face alone."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from uika.assets import TINY_WEIGHTS
+from uika.model import ModelConfig, Reconstructor, build, load_checkpoint
+
+Make = Callable[..., dict[str, Any]]
+
+
+@torch.no_grad()
+def test_off_the_face_the_surface_keeps_its_observation(
+    small: ModelConfig, make_inputs: Make, perturb: Callable[[Reconstructor], Reconstructor]
+) -> None:
+    inputs = make_inputs()
+    surface, texel = inputs["surface"], inputs["texel"]
+    whole = perturb(build(small)).eval()(**inputs)
+    kept = perturb(build(dataclasses.replace(small, scope="face_colors"))).eval()(**inputs)
+    assert torch.equal(kept.means, surface.points)
+    assert torch.equal(kept.quats, surface.quats)
+    assert torch.equal(kept.scales, surface.scales)
+    assert bool((kept.opacities == small.gaussians.init_opacity).all())
+    face = surface.face.flatten()[texel][None, :, None]
+    seen = kept.aggregate.flatten(2)[:, :, texel].mT
+    assert (whole.means - kept.means).abs().max() > 1e-4
+    torch.testing.assert_close(kept.colors, seen + face * (whole.colors - seen), rtol=0, atol=1e-6)
+    assert bool((kept.fusion_weight[face[..., 0] == 0] == 0).all())
+
+
+def test_a_surface_that_does_not_know_its_face_is_refused(small: ModelConfig, make_inputs: Make) -> None:
+    inputs = make_inputs()
+    inputs["surface"] = dataclasses.replace(inputs["surface"], face=None)
+    with pytest.raises(ValueError, match=r"surface\.face is missing"):
+        build(dataclasses.replace(small, scope="face_colors")).eval()(**inputs)
+
+
+def test_the_built_in_weights_colour_faces_and_nothing_else() -> None:
+    assert load_checkpoint(TINY_WEIGHTS).config.scope == "face_colors"
