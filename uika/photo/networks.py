@@ -29,6 +29,18 @@ def face_boxes(images: Sequence[NDArray[np.uint8]], confidence: float = 0.5) -> 
     return found
 
 
+def face_scores(images: Sequence[NDArray[np.uint8]]) -> list[float]:
+    """How sure the two detector ranges are of the best face in each image [H,W,3], summed: 0 (no face) to 2."""
+    found = np.zeros(len(images))
+    with _solutions() as solutions:
+        for model in (1, 0):
+            with solutions.face_detection.FaceDetection(model_selection=model) as detector:
+                for index, image in enumerate(images):
+                    scores = [detection.score[0] for detection in detector.process(image).detections or ()]
+                    found[index] += max(scores, default=0.0)
+    return [float(score) for score in found]
+
+
 def face_meshes(images: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float64] | None]:
     """Landmarks [478,2] in pixels of the largest face in each image [H,W,3]; None where there is none."""
     found: list[NDArray[np.float64] | None] = []

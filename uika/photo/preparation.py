@@ -16,6 +16,7 @@ from uika.photo.detect import MIN_FACE, find_face
 from uika.photo.error import PhotoError
 from uika.photo.foreground import estimate_foreground
 from uika.photo.networks import person_mask
+from uika.photo.orientation import turned_by
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
 
@@ -54,7 +55,8 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
 
     The crop is a square of 1.5 times the head's box, the head being the face extended over the hair; it may reach
     outside the photo, where the matte is 0. A file with transparency around the person brings its own matte.
-    The same file gives the same result. Raises `PhotoError` when the file cannot be read or shows no face.
+    The same file gives the same result. Raises `PhotoError` when the file cannot be read, shows no face, or one on its
+    head.
     """
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise ValueError(f"size: must lie between {MIN_SIZE} and {MAX_SIZE} pixels, got {size}")
@@ -67,6 +69,8 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
         raise PhotoError(
             path, f"shows no face of {MIN_FACE} px or more; use an upright photo with the whole face in view"
         )
+    if degrees := turned_by(rgb, face):
+        raise PhotoError(path, f"the face in it is not upright; turn the photo by {degrees} degrees counterclockwise")
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
     crop = resample(rgb, square, size)

@@ -6,13 +6,14 @@ import queue
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uika.errors import UikaError
 from uika.io.media import open_media
+from uika.io.upright import shown_width, upright
 
 AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say
@@ -23,18 +24,26 @@ class VideoError(UikaError):
     """A video that cannot be read or shows no face; the message names it."""
 
 
+class VideoFrame(NamedTuple):
+    """One frame, turned as it is meant to be seen."""
+
+    grey: NDArray[np.uint8]  # [H,W]
+    rgb: NDArray[np.uint8]  # [H,W,3] sRGB; empty if colour was not asked for
+    seconds: float | None  # when it is shown, if the file says
+
+
 def video_frames(path: str | Path) -> Iterator[NDArray[np.uint8]]:
-    """The frames [H,W,3] of a video, sRGB.
+    """The frames [H,W,3] of a video, sRGB, turned as a player shows them.
 
     Raises:
         VideoError: the file is missing or no video.
     """
-    for _, rgb in decode(Path(path), colour=True):
-        yield rgb
+    for frame in decode(Path(path), colour=True):
+        yield frame.rgb
 
 
-def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-    """Grey [H,W] and, if asked for, colour [H,W,3] of each frame.
+def decode(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
+    """Each frame in grey and, if asked for, in colour.
 
     Raises:
         VideoError: the file is missing or no video.
@@ -48,14 +57,20 @@ def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8]
             if not container.streams.video:
                 raise VideoError(f"{path}: has no pictures in it")
             container.streams.video[0].thread_type = "AUTO"
+            aspect, size = container.streams.video[0].sample_aspect_ratio, None
             for frame in container.decode(video=0):
-                if frame.width * frame.height > MAX_PIXELS:
+                width = shown_width(frame, aspect)
+                if width * frame.height > MAX_PIXELS:
+                    raise VideoError(f"{path}: has {width}x{frame.height} pixels a frame; {MAX_PIXELS:,} are the most")
+                if size is not None and (frame.width, frame.height) != size:
                     raise VideoError(
-                        f"{path}: has {frame.width}x{frame.height} pixels a frame; {MAX_PIXELS:,} are the most"
+                        f"{path}: changes from {size[0]}x{size[1]} to {frame.width}x{frame.height} pixels at "
+                        f"{frame.time or 0:.2f} s; convert it to one size"
                     )
-                grey: Any = frame.to_ndarray(format="gray")
-                rgb: Any = frame.to_ndarray(format="rgb24") if colour else grey[:0]
-                yield grey, rgb
+                size = (frame.width, frame.height)
+                grey: Any = upright(frame.to_ndarray(format="gray", width=width), frame)
+                rgb: Any = upright(frame.to_ndarray(format="rgb24", width=width), frame) if colour else grey[:0]
+                yield VideoFrame(grey, rgb, frame.time)
     except VideoError:
         raise
     except (av.FFmpegError, ValueError) as error:
@@ -63,12 +78,12 @@ def decode(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8]
         raise VideoError(f"{path}: cannot be read as a video ({reason})") from error
 
 
-def decode_ahead(path: Path, colour: bool = False) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+def decode_ahead(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
     """`decode` in a thread of its own, a few frames ahead of whoever reads them."""
-    frames: queue.Queue[tuple[NDArray[np.uint8], NDArray[np.uint8]] | BaseException | None] = queue.Queue(AHEAD)
+    frames: queue.Queue[VideoFrame | BaseException | None] = queue.Queue(AHEAD)
     stopped = threading.Event()
 
-    def put(item: tuple[NDArray[np.uint8], NDArray[np.uint8]] | BaseException | None) -> None:
+    def put(item: VideoFrame | BaseException | None) -> None:
         while not stopped.is_set():
             try:
                 return frames.put(item, timeout=0.1)

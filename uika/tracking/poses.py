@@ -28,6 +28,16 @@ def without_gaps(poses: dict[int, Pose], count: int) -> list[Pose]:
     return complete
 
 
+def poses_between(poses: Sequence[Pose], places: Array) -> list[Pose]:
+    """The poses at `places` [S] between those of T frames."""
+    found = []
+    for place in places:
+        before = int(place)
+        after = min(before + 1, len(poses) - 1)
+        found.append(_between(poses[before], poses[after], float(place - before)))
+    return found
+
+
 def _between(one: Pose, other: Pose, share: float) -> Pose:
     def turned(a: Array, b: Array) -> Array:
         return rotation(share * axis_angle(b @ a.T)) @ a

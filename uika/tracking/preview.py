@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +36,18 @@ def write_preview(track: Track, source: str | Path, target: str | Path, head: He
         The number of frames.
     """
     colours = paint(head)
-    frames = counted(video_frames(source), progress, len(track.poses), "preview")
+    frames = counted(_repeated(video_frames(source), track.frames), progress, len(track.poses), "preview")
     pairs = zip(frames, track.poses, strict=False)
     return write_video(target, _pictures(track, pairs, head, colours), track.motion.fps)
+
+
+def _repeated(frames: Iterable[np.ndarray], wanted: Sequence[int]) -> Iterator[np.ndarray]:
+    """The frames with the `wanted` numbers, which rise; one wanted twice comes twice."""
+    place = 0
+    for index, frame in enumerate(frames):
+        while place < len(wanted) and wanted[place] == index:
+            yield frame
+            place += 1
 
 
 def tracked_camera(track: Track, pose: Pose, height: int) -> Camera:

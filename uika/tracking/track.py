@@ -21,10 +21,11 @@ from uika.head.axis_angle import Array
 from uika.head.landmark_model import FrameModel, Pose, frame_model
 from uika.io.progress import counted
 from uika.motion import Motion
+from uika.motion.frame_times import even_places, is_even, rate_of
 from uika.motion.smoothing import smoothed
 from uika.tracking.appearance import BLURS, LANDMARK_PULL, learn_appearance, track_appearance
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate
-from uika.tracking.poses import poses_to_motion, without_gaps
+from uika.tracking.poses import poses_between, poses_to_motion, without_gaps
 
 IDENTITY_FRAMES = 8  # the first guess of identity and focal length comes from these
 KEY_FRAMES = 12  # at least; the person's colours and final identity come from these
@@ -36,8 +37,9 @@ class Track:
     """A tracked video of T frames.
 
     motion: expression, jaw, eyes and the head's rotation and translation as seen from the camera, smoothed.
-    identity: [K] the person's. focal: pixels, fixed. poses: per frame, as fitted. lost: frames without a face, filled
-    in between their neighbours. error: mean landmark distance in outer eye-corner distances. seconds: per stage.
+    identity: [K] the person's. focal: pixels, fixed. poses: as fitted, one for each frame of the motion; those of a
+    video whose frames are not evenly spaced lie between its frames. lost: frames of the video without a face, filled in
+    between their neighbours. error: mean landmark distance in outer eye-corner distances. seconds: per stage.
     """
 
     motion: Motion
@@ -47,6 +49,7 @@ class Track:
     lost: tuple[int, ...]
     error: float
     size: tuple[int, int]  # width and height in pixels
+    frames: tuple[int, ...]  # of the video, the one nearest in time to each pose
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -56,6 +59,7 @@ class _Seen:
     keys: dict[int, FaceCrop]  # sharp views of some frames
     fps: float
     size: tuple[int, int]
+    places: Array | None  # where the frames of the motion lie between those of the video; None if they are the same
 
 
 def track_video(
@@ -102,18 +106,22 @@ def track_video(
     seconds["identity"] = time.perf_counter() - start
     start = time.perf_counter()
     frames = counted(decode_ahead(Path(path)), progress, len(seen.landmarks), "follow")
-    poses = track_appearance(person, model, rough, targets, (grey for grey, _ in frames), centre)
+    poses = track_appearance(person, model, rough, targets, (frame.grey for frame in frames), centre)
     seconds["follow"] = time.perf_counter() - start
     complete = without_gaps(poses, len(seen.landmarks))
+    places = np.arange(len(complete), dtype=np.float64) if seen.places is None else seen.places
+    if seen.places is not None:
+        complete = poses_between(complete, places)
     motion = poses_to_motion(complete, model, head, identity, seen.fps)
     return Track(
         motion=smoothed(motion) if smooth else motion,
         identity=identity.float(),
         focal=shared.focal,
         poses=tuple(complete),
-        lost=tuple(index for index in range(len(complete)) if index not in targets),
+        lost=tuple(index for index, marks in enumerate(seen.landmarks) if marks is None),
         error=float(np.mean(errors)),
         size=seen.size,
+        frames=tuple(places.round().astype(int).tolist()),
         seconds=seconds,
     )
 
@@ -121,21 +129,26 @@ def track_video(
 def _look(path: Path, progress: bool) -> _Seen:
     """Landmarks of all frames, and views of evenly spread key frames."""
     from uika.photo.networks import follow_meshes
+    from uika.photo.orientation import turned_by
 
     landmarks: list[Array | None] = []
     keys: dict[int, FaceCrop] = {}
     greys: list[NDArray[np.uint8]] = []
+    times: list[float | None] = []
     stride, size = 1, (0, 0)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        for grey, rgb in counted(decode_ahead(path, colour=True), progress, None, "landmarks"):
-            greys[:] = [grey]
-            yield rgb
+        for frame in counted(decode_ahead(path, colour=True), progress, None, "landmarks"):
+            greys[:] = [frame.grey]
+            times.append(frame.seconds)
+            yield frame.rgb
 
     for index, (image, marks) in enumerate(follow_meshes(pictures())):
         if index >= MAX_FRAMES:
             raise VideoError(f"{path}: has more than {MAX_FRAMES} frames; cut it into parts")
         size = (image.shape[1], image.shape[0])
+        if marks is not None and not keys and (degrees := turned_by(image, marks)):
+            raise VideoError(f"{path}: its face is not upright; turn the video by {degrees} degrees counterclockwise")
         landmarks.append(marks)
         if marks is not None and index % stride == 0:
             keys[index] = crop_face(greys[0], marks, np.array(size) / 2, BLURS[-1][0])
@@ -144,7 +157,24 @@ def _look(path: Path, progress: bool) -> _Seen:
             keys = {index: view for index, view in keys.items() if index % stride == 0}
     if not landmarks:
         raise VideoError(f"{path}: has no pictures in it")
-    return _Seen(landmarks, keys, frame_rate(path), size)
+    fps, places = _pace(path, times)
+    return _Seen(landmarks, keys, fps, size, places)
+
+
+def _pace(path: Path, times: list[float | None]) -> tuple[float, Array | None]:
+    """Frames per second, and where the frames of that rate lie between the video's if those are not evenly spaced."""
+    fps = frame_rate(path)
+    known = [time for time in times if time is not None]
+    if len(known) < 2 or len(known) < len(times):
+        return fps, None
+    seconds = np.array(known) - known[0]
+    if (np.diff(seconds) < 0).any() or seconds[-1] <= 0 or is_even(seconds, fps):
+        return fps, None
+    fps = rate_of(seconds)
+    try:
+        return fps, None if is_even(seconds, fps) else even_places(seconds, fps)
+    except ValueError as error:
+        raise VideoError(f"{path}: {error}; cut it into parts") from error
 
 
 def _shared_identity(targets: dict[int, Array], head: HeadModel) -> LandmarkFit:

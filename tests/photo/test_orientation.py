@@ -1,0 +1,55 @@
+"""Faces that do not stand upright: right landmarks, or a refusal that says how to turn the photo."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from uika.photo import PhotoError, prepare
+from uika.photo.detect import find_face
+from uika.photo.orientation import turned_by
+
+
+@pytest.fixture(scope="module")
+def image(portrait_path: Path) -> Image.Image:
+    return Image.open(portrait_path).convert("RGB")
+
+
+@pytest.fixture(scope="module")
+def truth(image: Image.Image) -> np.ndarray:
+    found = find_face(np.asarray(image))
+    assert found is not None
+    return found
+
+
+def turned(image: Image.Image, truth: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """The picture turned counterclockwise on a grey ground, and the landmarks in it."""
+    other = image.rotate(degrees, Image.Resampling.BICUBIC, expand=True, fillcolor=(128, 128, 128))
+    angle = np.deg2rad(degrees)
+    matrix = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return np.asarray(other), (truth - np.array(image.size) / 2) @ matrix.T + np.array(other.size) / 2
+
+
+@pytest.mark.parametrize("degrees", [0, 20, -35, 60, -75, 90, -90])
+def test_leaning_faces_are_read(degrees: float, image: Image.Image, truth: np.ndarray) -> None:
+    photo, want = turned(image, truth, degrees)
+    found = find_face(photo)
+    assert found is not None and turned_by(photo, found) == 0
+    assert np.linalg.norm(found - want, axis=1).mean() < 0.03 * np.ptp(truth[:, 1])
+
+
+@pytest.mark.parametrize("degrees", [120, 135, 150, 165, 180, 200, 225, -120])
+def test_faces_on_their_head_are_refused(degrees: float, image: Image.Image, truth: np.ndarray, tmp_path: Path) -> None:
+    Image.fromarray(turned(image, truth, degrees)[0]).save(tmp_path / "scan.png")
+    with pytest.raises(PhotoError, match=r"scan\.png: .*(turn the photo by|upright photo)"):
+        prepare(tmp_path / "scan.png", 128)
+
+
+@pytest.mark.parametrize("turn", ["ROTATE_180", "FLIP_TOP_BOTTOM"])
+@pytest.mark.parametrize("scale", [0.75, 1.0, 2.0])
+def test_how_to_turn_a_scan_is_said(turn: str, scale: float, image: Image.Image, tmp_path: Path) -> None:
+    size = tuple(round(side * scale) for side in image.size)
+    image.transpose(Image.Transpose[turn]).resize(size).save(tmp_path / "scan.jpg", quality=90)
+    with pytest.raises(PhotoError, match=r"scan\.jpg: "):
+        prepare(tmp_path / "scan.jpg", 128)
