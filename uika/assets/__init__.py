@@ -6,4 +6,5 @@ _FOLDER = Path(__file__).resolve().parent
 PORTRAIT = _FOLDER / "portrait.jpg"
 HEAD = _FOLDER / "head.npz"
 TINY_WEIGHTS = _FOLDER / "tiny.safetensors"
+FACE_MODELS = _FOLDER / "face"
 LANDMARK_BIAS = _FOLDER / "detector_bias.npz"

@@ -1,32 +1,27 @@
-"""The three mediapipe models behind plain functions. Their weights lie in the mediapipe wheel: no network is used."""
+"""The face and person models behind plain functions; their weights come with the package and no network is used."""
 
 from __future__ import annotations
 
-import os
-import threading
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_STDERR_LOCK = threading.RLock()
+_MASK_SIDE = 256  # pixels that the person model sees
 
 
 def face_boxes(images: Sequence[NDArray[np.uint8]], confidence: float = 0.5) -> list[list[tuple[float, ...]]]:
     """Boxes (x0, y0, width, height) in pixels of every face in each image [H,W,3], by both detector ranges."""
-    found: list[list[tuple[float, ...]]] = [[] for _ in images]
-    with _solutions() as solutions:
-        for model in (1, 0):
-            with solutions.face_detection.FaceDetection(confidence, model_selection=model) as detector:
-                for boxes, image in zip(found, images, strict=True):
-                    height, width = image.shape[:2]
-                    for detection in detector.process(image).detections or ():
-                        box = detection.location_data.relative_bounding_box
-                        boxes.append((box.xmin * width, box.ymin * height, box.width * width, box.height * height))
-    return found
+    from uika.photo.face_detector import detect_faces
+
+    return [
+        [
+            (float(x0), float(y0), float(x1 - x0), float(y1 - y0))
+            for reach in ("full", "short")
+            for (x0, y0, x1, y1), _, _ in detect_faces(image, reach, confidence)  # type: ignore[arg-type]
+        ]
+        for image in images
+    ]
 
 
 def face_scores(images: Sequence[NDArray[np.uint8]]) -> list[float]:
@@ -43,19 +38,10 @@ def face_scores(images: Sequence[NDArray[np.uint8]]) -> list[float]:
 
 def face_meshes(images: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float64] | None]:
     """Landmarks [478,2] in pixels of the largest face in each image [H,W,3]; None where there is none."""
-    found: list[NDArray[np.float64] | None] = []
-    with (
-        _solutions() as solutions,
-        solutions.face_mesh.FaceMesh(static_image_mode=True, refine_landmarks=True, max_num_faces=4) as mesh,
-    ):
-        for image in images:
-            size = np.array(image.shape[1::-1], dtype=np.float64)
-            faces = [
-                np.array([(point.x, point.y) for point in face.landmark]) * size
-                for face in mesh.process(image).multi_face_landmarks or ()
-            ]
-            found.append(max(faces, key=lambda face: float(np.ptp(face, axis=0).prod()), default=None))
-    return found
+    from uika.photo import face_mesh
+
+    found = (face_mesh.face_meshes(image) for image in images)
+    return [max(faces, key=lambda face: float(np.ptp(face, axis=0).prod()), default=None) for faces in found]
 
 
 def follow_meshes(
@@ -65,49 +51,20 @@ def follow_meshes(
 
     Faster and steadier than `face_meshes`, because a face is looked for where it was in the image before.
     """
-    with _solutions() as solutions:
-        mesh = solutions.face_mesh.FaceMesh(refine_landmarks=True, max_num_faces=1)
-        mesh.process(np.zeros((64, 64, 3), dtype=np.uint8))  # whatever it logs, it logs at the first image
-    with mesh:
-        for image in images:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                found = mesh.process(image).multi_face_landmarks
-            size = np.array(image.shape[1::-1], dtype=np.float64)
-            yield image, np.array([(point.x, point.y) for point in found[0].landmark]) * size if found else None
+    from uika.photo.face_mesh import follow_mesh
+
+    return follow_mesh(images)
 
 
 def person_mask(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Rough probability [H,W] in [0,1] that a pixel of image [H,W,3] belongs to a person."""
-    with _solutions() as solutions, solutions.selfie_segmentation.SelfieSegmentation(model_selection=0) as model:
-        return np.clip(model.process(image).segmentation_mask, 0.0, 1.0).astype(np.float32)
+    import torch
 
+    from uika.photo.regions_of_interest import Region, sampled
+    from uika.photo.tflite import run
 
-@contextmanager
-def _solutions() -> Iterator[Any]:
-    """`mediapipe.solutions`, imported on first use, with its warnings and its native log lines kept off stderr."""
-    with warnings.catch_warnings(), _native_stderr_closed():
-        warnings.simplefilter("ignore")  # protobuf 4 deprecates calls that this mediapipe makes
-        try:
-            import mediapipe
-        except ImportError as error:
-            raise ImportError("reading photos needs mediapipe: pip install 'uika-drjit[photo]'") from error
-        yield mediapipe.solutions
-
-
-@contextmanager
-def _native_stderr_closed() -> Iterator[None]:
-    """Point file descriptor 2 at the null device: TFLite and absl log there, and no variable or call stops them."""
-    with _STDERR_LOCK:
-        try:
-            saved = os.dup(2)
-        except OSError:  # a process without stderr has nothing to silence
-            yield
-            return
-        try:
-            with open(os.devnull, "wb") as null:  # noqa: PTH123
-                os.dup2(null.fileno(), 2)
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
+    height, width = image.shape[:2]
+    seen = sampled(image, Region(width / 2, height / 2, width, height, 0.0), _MASK_SIDE, border=False)
+    mask = torch.from_numpy(run("selfie", seen)[0][0, ..., 0])[None, None]
+    whole = torch.nn.functional.interpolate(mask, (height, width), mode="bilinear", align_corners=False)
+    return whole[0, 0].clamp(0, 1).numpy()
