@@ -6,11 +6,11 @@ from __future__ import annotations
 EXTRAS = {
     "av": "cli",
     "openfacefx": "cli",
-    "cv2": "photo",
+    "ai_edge_litert": "photo",
+    "cv2": "view",
     "PIL": "cli",
     "tqdm": "cli",
     "tyro": "cli",
-    "mediapipe": "photo",
     "pillow_heif": "photo",
     "scipy": "photo",
     "mitsuba": "scenes",

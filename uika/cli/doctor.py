@@ -13,7 +13,8 @@ from uika.errors import EXTRAS, install_command
 
 _CORE = ("torch", "drjit", "numpy", "safetensors")
 _MODULES = {
-    "opencv-contrib-python": "cv2",
+    "ai-edge-litert": "ai_edge_litert",
+    "opencv-python-headless": "cv2",
     "pillow": "PIL",
     "pillow-heif": "pillow_heif",
 }  # distribution -> import name, where they differ

@@ -12,8 +12,10 @@ from uika.photo.regions_of_interest import Region, sampled
 from uika.photo.tflite import run
 
 Range = Literal["short", "full"]
+RANGES: tuple[Range, ...] = ("full", "short")
 _SIZES = {"short": 128, "full": 192}  # pixels that a detector sees
 _CELLS = {"short": ((16, 2), (8, 6)), "full": ((48, 1),)}  # cells along a side, and guesses in each
+_SURE = {"short": 0.5, "full": 0.6}  # score from which a guess counts
 _SUPPRESSED = 0.3  # intersection over union from which two guesses mean one face
 _SCORE_LIMIT = 100.0
 
@@ -26,8 +28,9 @@ class Detection(NamedTuple):
     score: float
 
 
-def detect_faces(image: NDArray[np.uint8], reach: Range, confidence: float = 0.5) -> list[Detection]:
-    """Faces in an image [H,W,3], the surest first; "short" is for faces near the camera, "full" for small ones."""
+def detect_faces(image: NDArray[np.uint8], reach: Range) -> list[Detection]:
+    """Faces in an image [H,W,3], the surest first; "short" is for faces near the camera, "full" for
+    small ones too."""
     size = _SIZES[reach]
     height, width = image.shape[:2]
     side = max(height, width)
@@ -35,7 +38,7 @@ def detect_faces(image: NDArray[np.uint8], reach: Range, confidence: float = 0.5
     guesses, scores = run(f"detection_{reach}", sampled(image, region, size, -1.0, border=False))
     score = 1 / (1 + np.exp(-scores[0, :, 0].astype(np.float64).clip(-_SCORE_LIMIT, _SCORE_LIMIT)))
     # MediaPipe numbers detections as the network does and takes the first of equals.
-    chosen = np.flatnonzero(score >= confidence)
+    chosen = np.flatnonzero(score >= _SURE[reach])
     values = guesses[0, chosen].astype(np.float64) / size
     anchors = _anchors(reach)[chosen]
     centre, half = values[:, :2] + anchors, values[:, 2:4] / 2

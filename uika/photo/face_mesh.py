@@ -119,7 +119,7 @@ def _crop(
     height, width = features.shape[:2]
     centres = np.arange(size) + 0.5
     place = np.stack(np.meshgrid(centres, centres), -1) @ matrix.T + shift - 0.5
-    inside = ((place >= 0) & (place <= (width - 1, height - 1))).all(-1)
+    inside = np.asarray(((place >= 0) & (place <= (width - 1, height - 1))).all(-1))
     cell = np.floor(place).astype(np.int64)
     x, y = (place - cell).astype(np.float32).transpose(2, 0, 1)[..., None]
     column, row = cell[..., 0].clip(0, width - 1), cell[..., 1].clip(0, height - 1)

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 _MASK_SIDE = 256  # pixels that the person model sees
 
 
-def face_boxes(images: Sequence[NDArray[np.uint8]], confidence: float = 0.5) -> list[list[tuple[float, ...]]]:
+def face_boxes(images: Sequence[NDArray[np.uint8]]) -> list[list[tuple[float, ...]]]:
     """Boxes (x0, y0, width, height) in pixels of every face in each image [H,W,3], by both detector ranges."""
-    from uika.photo.face_detector import detect_faces
+    from uika.photo.face_detector import RANGES, detect_faces
 
     return [
         [
             (float(x0), float(y0), float(x1 - x0), float(y1 - y0))
-            for reach in ("full", "short")
-            for (x0, y0, x1, y1), _, _ in detect_faces(image, reach, confidence)  # type: ignore[arg-type]
+            for reach in RANGES
+            for (x0, y0, x1, y1), _, _ in detect_faces(image, reach)
         ]
         for image in images
     ]

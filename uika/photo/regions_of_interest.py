@@ -1,4 +1,4 @@
-"""Turned rectangles of a picture as the face models want to see them: MediaPipe's arithmetic, to the last grey level."""
+"""Turned rectangles of a picture as the face models see them: MediaPipe's arithmetic, to the last grey level."""
 
 from __future__ import annotations
 
