@@ -26,14 +26,12 @@ def face_boxes(images: Sequence[NDArray[np.uint8]]) -> list[list[tuple[float, ..
 
 def face_scores(images: Sequence[NDArray[np.uint8]]) -> list[float]:
     """How sure the two detector ranges are of the best face in each image [H,W,3], summed: 0 (no face) to 2."""
-    found = np.zeros(len(images))
-    with _solutions() as solutions:
-        for model in (1, 0):
-            with solutions.face_detection.FaceDetection(model_selection=model) as detector:
-                for index, image in enumerate(images):
-                    scores = [detection.score[0] for detection in detector.process(image).detections or ()]
-                    found[index] += max(scores, default=0.0)
-    return [float(score) for score in found]
+    from uika.photo.face_detector import RANGES, detect_faces
+
+    return [
+        sum(max((face.score for face in detect_faces(image, reach)), default=0.0) for reach in RANGES)
+        for image in images
+    ]
 
 
 def face_meshes(images: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float64] | None]:
