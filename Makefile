@@ -58,6 +58,7 @@ format: setup
 # With nothing else on the machine: they measure time.
 bench: setup
 	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.summary
 	$(BIN)/python tools/readme_figures.py
 
 # Shows that every benchmark runs, in less than three minutes.

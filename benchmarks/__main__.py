@@ -1,4 +1,4 @@
-"""Every benchmark, one after the other: `python -m benchmarks [--quick] [NAME ...]`.
+"""Every benchmark, one after the other: `python -m benchmarks [--quick] [NAME ...]`; `--list` says what makes what.
 
 Each runs in a process of its own and writes NAME.json, NAME.md and NAME.png with the machine described; one that does
 not is an error. With `--quick` all run on next to nothing and write to out/bench-quick: that shows that they run, and
@@ -16,6 +16,8 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from benchmarks import sources
 
 ENDINGS = (".json", ".md", ".png")
 QUICK_RESULTS = Path("out") / "bench-quick"
@@ -39,6 +41,8 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "tracking": ("--seconds", "1"),
     "fit_accuracy": ("--people", "1", "--refined", "0"),
     "mitsuba_spp": ("--size", "64", "--reference", "64", "--renders", "20"),
+    "synthesis_quality": ("--sheet", "2", "--people", "1", "--size", "64"),
+    "scene_validation": ("--poses", "1", "--views", "1"),
     "synthesis_speed": ("--sizes", "64", "--identities", "1", "--frames", "1"),
     "watermark": ("--pictures", "2", "--unmarked", "6"),
     "endurance": ("--steps", "6", "--frames", "6"),
@@ -73,7 +77,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(SCRIPTS)}")
     parser.add_argument("--quick", action="store_true", help="on next to nothing, to see that they run")
+    parser.add_argument("--list", action="store_true", help="print the command behind each committed result")
     arguments = parser.parse_args(argv)
+    if arguments.list:
+        print(sources.listing())
+        return
     unknown = [name for name in arguments.names if name not in SCRIPTS]
     if unknown:
         parser.error(f"no benchmark is called {', '.join(unknown)}")

@@ -7,7 +7,9 @@ the float64 image of every pair above 1e-7 that never stops a pixel.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -45,6 +47,16 @@ CHOICES: dict[str, dict[str, Options]] = {
 }
 
 
+SHORT = {
+    "alpha threshold": "α {}",
+    "transmittance cut": "T {}",
+    "exponential": "exp {}",
+    "tiles": "{}",
+    "both": "α, T {}",
+}
+LINES = 17  # of text that fit into a panel's height
+
+
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """The (error, time) points that no other beats in both, by increasing error."""
     kept: list[tuple[float, float]] = []
@@ -55,36 +67,70 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def figure(rows: list[dict[str, object]], scenes: Sequence[str]) -> None:
-    """Time against RMSE, a panel for each scene, one colour for each kind of setting, and the front of the best."""
+    """Time against RMSE, a panel for each scene, one colour for each kind of setting, and the front of the best.
+
+    The width is that of a README's column, where the letters are as large as its text.
+    """
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(7.5 * len(scenes), 5.5), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(9, 3.7 * len(scenes)), dpi=200, layout="constrained")
     for place, scene in enumerate(scenes, 1):
-        axes = drawing.add_subplot(1, len(scenes), place)
+        axes = drawing.add_subplot(len(scenes), 1, place)
         here = [row for row in rows if row["scene"] == scene]
-        where = {id(row): (float(str(row["RMSE"])), float(str(row["f + b ms"]))) for row in here}
+        where = {
+            f"{row['group']}: {row['setting']}": (float(str(row["RMSE"])), float(str(row["f + b ms"]))) for row in here
+        }
         best = front(list(where.values()))
-        axes.plot(
-            [x for x, _ in best], [y for _, y in best], color="grey", linewidth=1, drawstyle="steps-post", zorder=0
-        )
+        axes.plot(*zip(*best, strict=True), color="grey", linewidth=1, drawstyle="steps-post", zorder=0)
         for group in CHOICES:
-            points = [where[id(row)] for row in here if row["group"] == group]
-            axes.scatter([x for x, _ in points], [y for _, y in points], s=42, label=group)
-        (default,) = (where[id(row)] for row in here if row["setting"] == DEFAULT)
-        axes.scatter(*default, s=260, marker="*", color="black", zorder=3)
-        placed: list[tuple[float, float]] = []
-        for row in sorted(here, key=lambda r: where[id(r)][1]):
-            x, y = where[id(row)]
-            clash = sum(0.4 < x / a < 2.5 and abs(y / b - 1) < 0.06 for a, b in placed)
-            placed.append((x, y))
+            points = [point for name, point in where.items() if name.startswith(f"{group}: ")]
+            axes.scatter(*zip(*points, strict=True), s=36, label=group)
+        default = where[f"alpha threshold: {DEFAULT}"]
+        axes.scatter(*default, s=200, marker="*", color="black", zorder=3)
+        slow = max(y for _, y in where.values())
+        fast = min(y for _, y in where.values())
+        for names, (x, y) in clusters(where, (slow / fast) ** (1 / LINES)):
+            left = 0.2 * default[0] < x < 0.95 * default[0]
             axes.annotate(
-                str(row["setting"]), (x, y), xytext=(8, 4 + 11 * clash), textcoords="offset points", fontsize=8
+                "; ".join(names),
+                (x, y),
+                xytext=(-8 if left else 10, 0),
+                textcoords="offset points",
+                fontsize=9,
+                ha="right" if left else "left",
+                va="center",
+                zorder=1,  # under the points
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.8},
             )
-        axes.set(xscale="log", yscale="log", title=scene)
+        axes.set(xscale="log", yscale="log", title=scene, xlim=(1e-7, 1), ylim=(fast / 1.06, slow * 1.06))
         axes.set(xlabel="RMSE against the image without skips", ylabel="forward + backward, ms")
-        axes.grid(True, which="both", alpha=0.25)
-        axes.legend(fontsize=8)
+        ticks = [
+            value for value in (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45, 50, 60, 80) if fast <= value <= slow
+        ]
+        axes.set_yticks(ticks, [str(value) for value in ticks])
+        axes.minorticks_off()
+        axes.grid(True, alpha=0.25)
+        axes.legend(fontsize=9, loc="upper right")
     drawing.savefig(RESULTS / "rasterizer_pareto.png")
+
+
+def clusters(where: Mapping[str, tuple[float, float]], step: float) -> list[tuple[list[str], tuple[float, float]]]:
+    """Settings whose points are too close for two lines of text, by falling time; each gets one label.
+
+    Args:
+        where: "group: setting" -> (error, time).
+        step: ratio of two times that lie one line apart.
+    """
+    found: list[tuple[list[str], tuple[float, float]]] = []
+    for name, (x, y) in sorted(where.items(), key=lambda item: -item[1][1]):
+        near = [each for each in found if each[1][1] / y < step and 1 / 1.6 < each[1][0] / x < 1.6]
+        group, _, setting = name.partition(": ")
+        text = "default" if setting == DEFAULT else SHORT[group].format(setting.removeprefix("degree "))
+        if near:
+            min(near, key=lambda each: abs(math.log(each[1][1] / y)))[0].append(text)
+        else:
+            found.append(([text], (x, y)))
+    return found
 
 
 def measure(name: str, repeats: int) -> list[dict[str, object]]:
@@ -129,7 +175,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=12)
     parser.add_argument("--scenes", nargs="+", choices=(*NAMES, QUICK), default=["30k", "130k", "avatar"])
+    parser.add_argument("--draw", action="store_true", help="only the picture, from the JSON file of an earlier run")
     arguments = parser.parse_args(argv)
+    if arguments.draw:
+        rows = json.loads((RESULTS / "rasterizer_pareto.json").read_text())["rows"]
+        figure(rows, list(dict.fromkeys(row["scene"] for row in rows)))
+        return
     rows = [row for name in arguments.scenes for row in measure(name, arguments.repeats)]
     text = f"Forward + backward, minimum and median ms; `(default)` marks the default.\n\n{markdown(rows)}"
     save("rasterizer_pareto", "Rasterizer: run time against error", text, {"rows": rows})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -152,6 +153,21 @@ def test_files_are_short() -> None:
 
 def test_the_top_of_the_package_is_empty() -> None:
     assert {path.stem for path in (ROOT / "uika").glob("*.py")} == TOP
+
+
+def documented() -> dict[str, set[str]]:
+    """The table of docs/architecture.md: room -> rooms that it may import."""
+    rooms: dict[str, set[str]] = {}
+    for line in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 3 and cells[0].startswith("`"):
+            named, above = set(re.findall(r"`([\w.]+)`", cells[2])), set(rooms)
+            rooms[cells[0].strip("`")] = above - named if cells[2].startswith("all above") else named
+    return rooms
+
+
+def test_the_documentation_tells_the_same_rules() -> None:
+    assert documented() == ROOMS
 
 
 @pytest.mark.parametrize(

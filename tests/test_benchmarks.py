@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 import benchmarks.__main__ as runner
-from benchmarks import compare
+from benchmarks import compare, sources, summary
+from tools import readme_figures
 
 FOLDER = Path(runner.__file__).parent
 
@@ -20,6 +21,34 @@ def test_the_scripts_that_are_run_write_figures() -> None:
 def test_every_result_can_be_compared(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compare.main([str(path), str(path)]) == 0
     assert "0 worse, 0 better, 0 gone" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", sources.results(), ids=lambda path: path.name)
+def test_every_result_and_picture_has_a_script_that_names_it(path: Path) -> None:
+    script = sources.script(path)
+    if script is None:
+        assert sources.command(path) == sources.DRAWN and path.suffix == ".svg"
+        return
+    assert script.is_file(), f"{path.name} has no script: {script}"
+    named = {path.stem, *sources.command(path).split("--name ")[1:]}
+    if path.parent != FOLDER / "results" or path.stem in sources.COMMANDS:
+        named |= {path.stem.removeprefix("stress_"), path.stem.removesuffix("_paper")}
+    assert any(name in script.read_text() for name in named), f"{script.name} does not write {path.name}"
+
+
+@pytest.mark.parametrize("page", readme_figures.PAGES, ids=lambda page: page.stem)
+def test_pages_show_the_results_as_they_are(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert readme_figures.filled(text) == text, "run python tools/readme_figures.py"
+    assert all(readme_figures.table(name) for _, name, _ in readme_figures.MARKED.findall(text))
+
+
+def test_the_summary_is_taken_from_the_results() -> None:
+    assert readme_figures.table("summary") == summary.table(), "run python -m benchmarks.summary"
+
+
+def test_no_command_is_listed_for_what_is_not_there() -> None:
+    assert set(sources.COMMANDS) <= {path.stem for path in sources.results()}
 
 
 def test_a_script_that_writes_nothing_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
