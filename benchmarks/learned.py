@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from benchmarks.harness import markdown, save
+from tests.avatars import surface_avatar
 from uika.avatar import Avatar
-from uika.canonical.surface import surface_texels
 from uika.data import Capture
 from uika.data.datasets import find_people, open_person
 from uika.data.texture import true_texture
@@ -78,21 +78,7 @@ def mean_head(folder: Path, head: HeadModel, size: int) -> Avatar:
         if views[0].static_offset is not None:
             offset += views[0].static_offset / len(paths)
     color = diffuse(texture / share.clamp_min(1), (share > 0).float()[None], torch.full((1, 3, size, size), 0.5))[0]
-    identity = torch.zeros(len(head.identity_basis))
-    surface, binding = surface_texels(head, identity, offset, size)
-    return Avatar(
-        head_id=head.id,
-        identity=identity,
-        static_offset=offset,
-        means=surface.points[0],
-        quats=surface.quats[0],
-        scales=surface.scales[0],
-        opacities=torch.full((len(binding),), OPACITY),
-        colors=binding.from_map(color),
-        triangle=binding.triangle,
-        barycentric=binding.barycentric,
-        provenance={"model": "mean head"},
-    )
+    return surface_avatar(head, size, lambda _, binding: binding.from_map(color), offset, OPACITY, model="mean head")
 
 
 def unseen_texels(frames: Frames, count: int, avatars: dict[str, Avatar], head: HeadModel, size: int) -> dict[str, Any]:

@@ -16,10 +16,11 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.harness import RESULTS, markdown, save
+from tests.avatars import surface_avatar
 from uika.avatar import Avatar
 from uika.avatar.rig import Rig
-from uika.canonical.surface import surface_texels
-from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
+from uika.canonical.surface import SurfaceTexels
+from uika.head import Binding, HeadModel, HeadParameters, load_head, look_at, pose_gaussians, pose_vertices, uv_texels
 from uika.head.binding import rigid_turn
 from uika.motion.presets import expression_vector
 
@@ -33,22 +34,12 @@ def textured_avatar(head: HeadModel, size: int) -> tuple[Avatar, np.ndarray]:
     from scenes.people import paint, sample_person
 
     texture = linear_to_srgb(paint(sample_person(3, head), head, 1024)[0])
-    identity, still = torch.zeros(len(head.identity_basis)), torch.zeros_like(head.template)
-    surface, binding = surface_texels(head, identity, still, size)
-    cell = (binding.uv * len(texture)).long().clamp(max=len(texture) - 1)
-    avatar = Avatar(
-        head_id=head.id,
-        identity=identity,
-        static_offset=still,
-        means=surface.points[0],
-        quats=surface.quats[0],
-        scales=surface.scales[0],
-        opacities=torch.full((len(binding),), 0.95),
-        colors=torch.from_numpy(texture)[cell[:, 1], cell[:, 0]].float().clamp(0, 1),
-        triangle=binding.triangle,
-        barycentric=binding.barycentric,
-    )
-    return avatar, texture
+
+    def skin(_: SurfaceTexels, binding: Binding) -> torch.Tensor:
+        cell = (binding.uv * len(texture)).long().clamp(max=len(texture) - 1)
+        return torch.from_numpy(texture)[cell[:, 1], cell[:, 0]].float().clamp(0, 1)
+
+    return surface_avatar(head, size, skin), texture
 
 
 def fastest(work: Callable[[], object], repeats: int) -> tuple[float, float]:

@@ -1,16 +1,27 @@
-"""Small avatars for tests: the surface of a head with colours painted by position."""
+"""Small avatars for tests and benchmarks: the surface of a head with colours."""
+
+from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from uika import Avatar, HeadModel
-from uika.canonical.surface import surface_texels
+from uika.canonical.surface import SurfaceTexels, surface_texels
+from uika.head import Binding
 
 
-def painted_avatar(head: HeadModel, size: int = 64) -> Avatar:
-    """Red on the subject's left half, blue on the right, on the neutral head."""
-    identity, offset = torch.zeros(len(head.identity_basis)), torch.zeros_like(head.template)
+def surface_avatar(
+    head: HeadModel,
+    size: int,
+    colors: Callable[[SurfaceTexels, Binding], Tensor],
+    static_offset: Tensor | None = None,
+    opacity: float = 0.95,
+    **provenance: str,
+) -> Avatar:
+    """The mean head as splats, one for each texel [M] of an atlas of side `size`; `colors` gives theirs, [M,3]."""
+    identity = torch.zeros(len(head.identity_basis))
+    offset = torch.zeros_like(head.template) if static_offset is None else static_offset
     surface, binding = surface_texels(head, identity, offset, size)
-    left = (surface.points[0, :, :1] > 0).float()
     return Avatar(
         head_id=head.id,
         identity=identity,
@@ -18,9 +29,19 @@ def painted_avatar(head: HeadModel, size: int = 64) -> Avatar:
         means=surface.points[0],
         quats=surface.quats[0],
         scales=surface.scales[0],
-        opacities=torch.full((len(binding),), 0.95),
-        colors=left * torch.tensor([0.9, 0.1, 0.1]) + (1 - left) * torch.tensor([0.1, 0.1, 0.9]),
+        opacities=torch.full((len(binding),), opacity),
+        colors=colors(surface, binding),
         triangle=binding.triangle,
         barycentric=binding.barycentric,
-        provenance={"photos": "none", "note": "ünïcode"},
+        provenance=provenance,
     )
+
+
+def painted_avatar(head: HeadModel, size: int = 64) -> Avatar:
+    """Red on the subject's left half, blue on the right, on the neutral head."""
+
+    def halves(surface: SurfaceTexels, _: Binding) -> Tensor:
+        left = (surface.points[0, :, :1] > 0).float()
+        return left * torch.tensor([0.9, 0.1, 0.1]) + (1 - left) * torch.tensor([0.1, 0.1, 0.9])
+
+    return surface_avatar(head, size, halves, photos="none", note="ünïcode")

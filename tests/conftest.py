@@ -1,4 +1,4 @@
-"""The last line of a run says which tests were skipped, and why."""
+"""A fixture of all tests, and the last line of a run, which says which tests were skipped and why."""
 
 from __future__ import annotations
 
@@ -7,6 +7,17 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Let torch work in one thread."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def skipped(stats: dict[str, list[Any]]) -> str:

@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.avatars import painted_avatar
-from tests.heads import sphere_head
 from uika import Avatar, HeadModel, frames, get_motion, neutral_camera
 from uika.avatar import AvatarError
 from uika.avatar.frame_renderer import film
@@ -12,16 +10,6 @@ from uika.io.video import to_bytes
 from uika.motion import Motion
 
 SIZE = 96
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return sphere_head()
-
-
-@pytest.fixture(scope="module")
-def avatar(head: HeadModel) -> Avatar:
-    return painted_avatar(head, 48)
 
 
 def _moving(head: HeadModel, count: int) -> Motion:

@@ -3,11 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.avatars import painted_avatar
-from tests.heads import sphere_head
 from uika import (
-    Avatar,
-    HeadModel,
     HeadParameters,
     UikaError,
     frames,
@@ -22,16 +18,6 @@ from uika.cli.contact_sheet import contact_sheet
 from uika.io.video import to_bytes
 
 SIZE = 96
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return sphere_head()
-
-
-@pytest.fixture(scope="module")
-def avatar(head: HeadModel) -> Avatar:
-    return painted_avatar(head, 48)
 
 
 def _center(picture):

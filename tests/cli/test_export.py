@@ -3,22 +3,8 @@ from pathlib import Path
 import pytest
 
 from drjit_splat import load_ply
-from tests.avatars import painted_avatar
-from tests.heads import sphere_head
-from uika import load_head
 from uika.cli import main
 from uika.export import glb_provenance, html_provenance, read_splat
-from uika.head import save_head
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
-    save_head(sphere_head(), tmp_path / "small.npz")
-    monkeypatch.setenv("UIKA_HEAD", str(tmp_path / "small.npz"))
-    painted_avatar(load_head(), 32).save(tmp_path / "a.safetensors")
-    (tmp_path / "work").mkdir()
-    monkeypatch.chdir(tmp_path / "work")
-    return tmp_path / "work"
 
 
 def test_every_format_is_written(folder, capsys):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.fitting.landmarks import seen
 from tests.flame_files import flame_arrays
 from uika.fitting.bundle_adjustment import bundle
 from uika.fitting.frame_fit import fit_frame
@@ -23,13 +24,6 @@ FRONT = np.diag([1.0, -1.0, -1.0])
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
     return load_head()
-
-
-def seen(model: FrameModel, pose: Pose) -> Array:
-    camera = head_landmarks(model, pose) @ pose.rotation.T + pose.translation
-    marks = np.zeros((478, 2))
-    marks[model.ids] = model.focal * camera[:, :2] / camera[:, 2:]
-    return marks
 
 
 def rest(model: FrameModel) -> Pose:

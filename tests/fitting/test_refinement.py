@@ -5,14 +5,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.fitting.landmarks import seen
 from uika.fitting import fit_landmarks
 from uika.fitting.landmark_prior import identity_modes, landmark_anchor, landmark_trust
 from uika.fitting.landmarks import eye_distance
 from uika.fitting.refinement import refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
-from uika.head.axis_angle import Array, rotation
+from uika.head.axis_angle import rotation
 from uika.head.face_paint import paint, shade
-from uika.head.landmark_model import FrameModel, Pose, frame_model, head_landmarks, moved, shifted
+from uika.head.landmark_model import FrameModel, Pose, frame_model, moved, shifted
 
 FOCAL = 1200.0
 SIZE = 256
@@ -27,13 +28,6 @@ def head() -> HeadModel:
 def turned(model: FrameModel) -> Pose:
     turn = np.diag([1.0, -1.0, -1.0]) @ rotation(np.array([0.05, 0.3, 0.0]))
     return Pose(np.full(len(model.free), 0.1), np.zeros((0, 3, 3)), turn, np.array([0.0, 0.0, 1.1]))
-
-
-def seen(model: FrameModel, pose: Pose) -> Array:
-    camera = head_landmarks(model, pose) @ pose.rotation.T + pose.translation
-    marks = np.zeros((478, 2))
-    marks[model.ids] = model.focal * camera[:, :2] / camera[:, 2:]
-    return marks
 
 
 def test_smooth_errors_earn_less_trust_than_noise(head: HeadModel) -> None:

@@ -1,6 +1,6 @@
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -183,14 +183,6 @@ def test_bad_arguments_are_named(small: ModelConfig, make_inputs: Make) -> None:
 def test_tiny_fits_its_budget() -> None:
     model = build("tiny")
     assert sum(p.numel() for p in model.parameters()) < 10_000_000
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -5,24 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.filmed import FPS, act
-from uika.head import HeadModel, load_head, rodrigues
+from tests.filmed import FPS
+from uika.head import HeadModel, rodrigues
 from uika.photo.networks import follow_meshes
 from uika.tracking import FaceFollower, VideoError, video_frames
 from uika.tracking.live import LEARNING_FRAMES
 from uika.viewer import CameraFace
 from uika.viewer import camera as camera_module
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return load_head()
-
-
-@pytest.fixture(scope="module")
-def acted(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, torch.Tensor]:
-    path = tmp_path_factory.mktemp("video") / "act.mp4"
-    return path, act(head, path)
 
 
 def test_follower_learns_and_then_turns_as_the_face_does(acted: tuple[Path, torch.Tensor], head: HeadModel) -> None:

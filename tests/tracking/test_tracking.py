@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.filmed import FPS, GAP, act
+from tests.filmed import FPS, GAP
 from tests.flame_files import flame_arrays
 from uika.cli import main
-from uika.head import HeadModel, load_head, pose_vertices, rodrigues
+from uika.head import HeadModel, pose_vertices, rodrigues
 from uika.head_import.flame_file import read_flame
 from uika.head_import.landmark_embedding import nearest
 from uika.io.video import write_video
@@ -18,18 +18,6 @@ from uika.motion import load_motion, read_motion
 from uika.motion.presets import get_motion
 from uika.motion.retargeting import transfer
 from uika.tracking import VideoError, track_video
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return load_head()
-
-
-@pytest.fixture(scope="module")
-def acted(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, torch.Tensor]:
-    """`act` in a file of its own, and the turns [T]."""
-    path = tmp_path_factory.mktemp("video") / "act.mp4"
-    return path, act(head, path)
 
 
 def test_track_command(acted: tuple[Path, torch.Tensor], head: HeadModel, tmp_path: Path, capsys) -> None:

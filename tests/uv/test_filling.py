@@ -1,5 +1,4 @@
 import time
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -147,14 +146,6 @@ def test_bad_arguments_are_named() -> None:
         fill(rgb, confidence, valid, prior=rgb)
     with pytest.raises(ValueError, match="beyond 63"):
         fill(rgb, confidence, valid, torch.full((8, 8), 64))
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("one_thread")
