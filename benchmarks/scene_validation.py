@@ -19,15 +19,16 @@ from benchmarks.harness import markdown, save
 from scenes.validation.__main__ import validate
 from scenes.validation.report import write_report
 from scenes.validation.views import AT_LEAST, LIMITS, POSES, VIEWS, ViewReport
-from tests.flame_files import flame_arrays, write_pickle
+from tests.flame_files import flame_arrays, write_obj, write_pickle
 from uika.head import HeadModel, load_head
 from uika.head_import import import_flame
 
 
 def flame_head(folder: Path) -> HeadModel:
     """The built-in head as a FLAME model file, imported again."""
-    path = write_pickle(folder / "model.pkl", flame_arrays())
-    return import_flame(path, folder / "head.npz")
+    arrays = flame_arrays()
+    path, obj = write_pickle(folder / "model.pkl", arrays), write_obj(folder / "head.obj", arrays)
+    return import_flame(path, folder / "head.npz", obj)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
