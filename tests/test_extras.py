@@ -93,7 +93,7 @@ def test_the_core_splats_and_names_what_a_command_lacks(installed: Installed) ->
         "    torch.ones(1), torch.ones(1, 3), torch.eye(4)[None], K, 32, 32)\n"
         "image.square().sum().backward(); assert float(image.max()) > 0.5 and means.grad.isfinite().all()\n"
         "import uika; head = uika.load_head()\n"
-        "assert not {'scipy', 'PIL', 'mitsuba', 'mediapipe', 'viser', 'tyro'} & set(sys.modules)"
+        "assert not {'scipy', 'PIL', 'mitsuba', 'ai_edge_litert', 'viser', 'tyro'} & set(sys.modules)"
     )
     installed.run("python", "-c", script)
     said = installed.run("uika", "render", "me.safetensors", code=2)
@@ -160,6 +160,6 @@ def test_train_makes_data_trains_and_evaluates(installed: Installed) -> None:
 def test_all_brings_no_tool_of_development(installed: Installed) -> None:
     listed = installed.run("python", "-m", "pip", "list", "--format", "freeze", "--disable-pip-version-check").lower()
     names = {line.partition("==")[0] for line in listed.splitlines()}
-    assert names >= {"mitsuba", "mediapipe", "viser", "webdataset", "tyro", "scipy"}
+    assert names >= {"mitsuba", "ai-edge-litert", "viser", "webdataset", "tyro", "scipy"}
     assert not names & {"pytest", "ruff", "mypy", "mkdocs", "gsplat", "hypothesis", "onnxruntime"}
     installed.run("uika", "doctor")
