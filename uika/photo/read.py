@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import threading
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ MAX_BYTES = 512 * 1024 * 1024
 MIN_SIDE = 64
 FORMATS = ("JPEG", "PNG", "WEBP", "HEIF")
 KINDS = "JPEG, PNG, WebP or HEIC"
+_FILTERS = threading.Lock()  # the filters of warnings are the whole process's
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def read(path: str | Path) -> Picture:
     or no photo.
     """
     data = _read_bytes(Path(path))
-    with warnings.catch_warnings():
+    with _FILTERS, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow warns of bombs, odd palettes and odd EXIF: judged below or harmless
         rgb, alpha, focal = _decode(path, data)
     return Picture(str(path), hashlib.sha256(data).hexdigest(), rgb, alpha, focal)

@@ -10,7 +10,7 @@ from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 from uika.reconstruction.canonical_head import CanonicalHead
-from uika.reconstruction.fitted_photos import PreparedPhoto, fit_prepared, prepare_file
+from uika.reconstruction.fitted_photos import PreparedPhoto, fit_prepared, prepare_files
 from uika.reconstruction.models import load_model
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble
 from uika.reconstruction.report import Report
@@ -58,7 +58,7 @@ class GrowingAvatar:
             raise UikaError(f"give 1 to {MAX_PHOTOS - len(self)} more photos of one person, not {len(photos)}")
         report = Report() if report is None else report
         with report.stage("photos"):
-            new = [prepare_file(path) for path in photos]
+            new = prepare_files(photos)
         return self._grown(self._photos, new, self._first, report)
 
     def refresh(self, report: Report | None = None) -> Avatar:
