@@ -29,10 +29,14 @@ llvm: $(READY)
 chromium: $(READY)
 	@$(BIN)/python -m tools.setup_chromium
 
+.PHONY: node
+node: $(READY)
+	@$(BIN)/python -m tools.setup_node
+
 demo: setup
 	$(BIN)/uika demo -o out/demo
 
-test: setup chromium
+test: setup chromium node
 	$(BIN)/python -m pytest -q
 
 # Ten thousand random scenes, 200 extreme ones, 100,000 damaged files, stopped commands: hours. Goes on where it was stopped.
@@ -43,7 +47,7 @@ stress: setup
 	$(BIN)/python -m tests.stress.report
 	$(BIN)/python tools/readme_figures.py
 
-test-all: setup chromium
+test-all: setup chromium node
 	$(BIN)/python -m pytest -q -m "slow or not slow"
 
 lint: setup

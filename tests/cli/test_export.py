@@ -24,12 +24,15 @@ def test_every_format_is_written(folder, capsys):
     assert "bound" in export("-o", "c.ply", "--with-binding")
     assert "85 files" in export("-o", "frames", "--motion", "talk")
     assert len(list(Path("frames").iterdir())) == 85
+    assert "3 morph targets, 5 joints, 85 frames at 25" in export("-o", "m.glb", "--mesh", "--motion", "talk")
+    assert glb_provenance("m.glb")["photos"] == "none"
+    assert "with a.mtl, a_0.png" in export("-o", "a.obj", "--motion", "talk", "--frame", "5", "--texture", "32")
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["-o", "a.obj"], "a.obj: the output's name must end in .ply"),
+        (["-o", "a.fbx"], "a.fbx: the output's name must end in .ply"),
         (["-o", "frames"], "needs --motion"),
         (["-o", "a.ply", "--motion", "talk"], "add --frame"),
         (["-o", "a.ply", "--frame", "3"], "--frame needs --motion"),
@@ -38,6 +41,10 @@ def test_every_format_is_written(folder, capsys):
         (["-o", "a.glb", "--axes", "y-up"], "--axes"),
         (["-o", "a.ply", "--count", "0"], "count"),
         (["-o", "a.html", "--motion", "dance"], "dance"),
+        (["-o", "a.ply", "--mesh"], "--mesh needs a .glb"),
+        (["-o", "a.glb", "--mesh", "--motion", "talk", "--frame", "3"], "neither --frame"),
+        (["-o", "a.obj", "--motion", "talk"], "add --frame"),
+        (["-o", "a.glb", "--mesh", "--texture", "9999"], "--texture must lie between 16 and 8192"),
     ],
 )
 def test_wrong_input_is_one_sentence(folder, capsys, arguments, says):

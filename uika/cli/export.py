@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from uika.head import HeadModel
     from uika.motion import Motion
 
-_KINDS = (".ply", ".splat", ".glb", ".html", ".npz")
+_KINDS = (".ply", ".splat", ".glb", ".obj", ".html", ".npz")
+_POSED = (".ply", ".splat", ".glb", ".obj")  # hold one pose
+_LARGEST = 8192  # texels; more than most graphics cards hold
 _TURNED = (".ply", ".splat", "")
 
 
@@ -30,11 +32,15 @@ class Export:
     avatar: Positional[Path]
     """The avatar file."""
     output: Annotated[Path, arg(aliases=["-o"])]
-    """.ply, .splat, .glb, .html, .npz, or a folder."""
+    """.ply, .splat, .glb, .obj, .html, .npz, or a folder."""
     motion: str | None = None
     """orbit, talk, expressions or a motion file; an .html plays talk if left out."""
     frame: int | None = None
-    """Frame of the motion that .ply, .splat and .glb show; without it they are canonical."""
+    """Frame of the motion that .ply, .splat, .glb and .obj show; without it they are canonical."""
+    mesh: bool = False
+    """Write a .glb with a textured, rigged mesh instead of Gaussians; --motion becomes its animation."""
+    texture: int = 1024
+    """Side of the textures of .obj and --mesh in texels."""
     with_binding: bool = False
     """Write a .ply relative to the triangles, as GaussianAvatars does."""
     axes: Literal["y-down", "y-up"] = "y-down"
@@ -59,7 +65,11 @@ class Export:
             raise UikaError(f"--frame must lie between 0 and {len(motion) - 1}, not {self.frame}")
         if self.count is not None:
             avatar = thinned(avatar, self.count)
-        print(f"wrote {self.output}: {len(avatar):,} Gaussians{self._write(kind, avatar, head, motion)}")
+        if self.mesh or kind == ".obj":
+            said = self._write_mesh(kind, avatar, head, motion)
+        else:
+            said = f"{len(avatar):,} Gaussians{self._write(kind, avatar, head, motion)}"
+        print(f"wrote {self.output}: {said}")
         return 0
 
     def _check(self, kind: str) -> None:
@@ -71,14 +81,30 @@ class Export:
             raise UikaError(f"{self.output}: the output's name must end in {', '.join(_KINDS)}, or name a folder")
         else:
             check_output(self.output, kind)
-        if self.frame is not None and (self.motion is None or kind not in (".ply", ".splat", ".glb")):
-            raise UikaError("--frame needs --motion and a .ply, .splat or .glb to write")
-        if self.motion is not None and self.frame is None and kind in (".ply", ".splat", ".glb"):
+        if self.mesh and (kind != ".glb" or self.frame is not None or self.count is not None):
+            raise UikaError("--mesh needs a .glb to write, and neither --frame nor --count")
+        if not 16 <= self.texture <= _LARGEST:
+            raise UikaError(f"--texture must lie between 16 and {_LARGEST}, not {self.texture}")
+        if self.frame is not None and (self.motion is None or kind not in _POSED):
+            raise UikaError("--frame needs --motion and a .ply, .splat, .glb or .obj to write")
+        if self.motion is not None and self.frame is None and kind in _POSED and not self.mesh:
             raise UikaError(f"{self.output}: holds one pose; add --frame, or name a folder for all of the motion")
         if self.with_binding and (kind != ".ply" or self.motion is not None):
             raise UikaError("--with-binding needs a .ply to write and no --motion: such a file is canonical")
         if self.axes == "y-up" and (kind not in _TURNED or self.with_binding):
             raise UikaError("--axes only concerns .ply and .splat files without --with-binding")
+
+    def _write_mesh(self, kind: str, avatar: Avatar, head: HeadModel, motion: Motion | None) -> str:
+        from uika import export
+
+        if kind == ".obj":
+            params = None if motion is None else motion.parameters(avatar.identity)[self.frame]
+            beside = export.write_obj(self.output, avatar, head, params, self.texture)
+            return f"{len(head.faces):,} triangles, with {', '.join(path.name for path in beside)}"
+        mesh = export.write_rigged_glb(self.output, avatar, head, motion, self.texture)
+        played = "" if motion is None else f", {len(motion)} frames at {motion.fps:g} a second"
+        size = self.output.stat().st_size / 1e6
+        return f"{len(head.faces):,} triangles, {len(mesh.morphs)} morph targets, 5 joints{played}, {size:.1f} MB"
 
     def _write(self, kind: str, avatar: Avatar, head: HeadModel, motion: Motion | None) -> str:
         """Write and say what else there is to say."""

@@ -3,7 +3,9 @@
 from uika.export.flat import read_splat, write_splat
 from uika.export.gltf import glb_provenance, read_glb, write_glb
 from uika.export.html import html_provenance, write_html
+from uika.export.obj import write_obj
 from uika.export.ply import write_bound_ply, write_ply, write_ply_sequence
+from uika.export.rigged import write_rigged_glb
 from uika.export.splats import Splats, posed_splats, thinned
 from uika.export.tables import write_npz
 
@@ -19,7 +21,9 @@ __all__ = [
     "write_glb",
     "write_html",
     "write_npz",
+    "write_obj",
     "write_ply",
     "write_ply_sequence",
+    "write_rigged_glb",
     "write_splat",
 ]
