@@ -16,7 +16,7 @@ import torch
 from scenes.arrays import aligned
 from scenes.geometry import SeamMesh, cut_seams
 from scenes.people.glasses import Glasses, glasses_topology
-from scenes.variant import load_mitsuba, single_threaded
+from scenes.variant import keeping_variant, load_mitsuba, single_threaded
 from uika.errors import UikaError
 from uika.head import Camera, HeadModel
 
@@ -73,6 +73,7 @@ class HeadScene:
         self._set(f"{_BSDF}.base_color.data", albedo)
         self._set(f"{_BSDF}.roughness.data", rough[..., None])
 
+    @keeping_variant()
     def pose(
         self,
         head: HeadModel,
@@ -123,6 +124,7 @@ class HeadScene:
                 kind = type(self.params[name])
                 _assign(self.params, name, kind(value.tolist()) if value.ndim == 1 else kind(value))
 
+    @keeping_variant()
     def _aim(self, camera: Camera) -> None:
         mi = load_mitsuba()
         for name, number in _sensor_values(camera).items():
@@ -136,6 +138,7 @@ class HeadScene:
 
 
 @lru_cache(maxsize=8)
+@keeping_variant()
 def load_head_scene(head: HeadModel, width: int, height: int, light: Light, integrator: str) -> HeadScene:
     """Load a scene file once for each head, image size, light and integrator.
 

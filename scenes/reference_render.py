@@ -11,13 +11,14 @@ import torch
 from scenes.colour import linear_to_srgb, srgb_to_linear
 from scenes.head_scene import HeadScene, Light, load_head_scene
 from scenes.people.glasses import Glasses
-from scenes.variant import FAST_VARIANT, load_mitsuba
+from scenes.variant import FAST_VARIANT, keeping_variant, load_mitsuba
 from uika.head import Camera, HeadModel
 
 AOVS = ("rgb", "linear", "mask", "depth", "normal", "uv", "triangle")
 _TRACED = ("depth", "normal", "uv", "triangle")
 
 
+@keeping_variant()
 def render(
     vertices: torch.Tensor | np.ndarray,
     head: HeadModel,

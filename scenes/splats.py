@@ -19,12 +19,13 @@ import torch
 from torch import Tensor
 
 from scenes.colour import srgb_to_linear
-from scenes.variant import FAST_VARIANT, load_mitsuba
+from scenes.variant import FAST_VARIANT, keeping_variant, load_mitsuba
 
 NAME = "gaussian_splats"
 
 
 @lru_cache(maxsize=1)
+@keeping_variant()
 def register_plugins() -> None:
     """Make `gaussian_splats` known to Mitsuba, once.
 

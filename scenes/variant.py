@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
+from typing import TypeVar
 
 from drjit_splat import llvm
 
 FAST_VARIANT = "llvm_ad_rgb"
 PLAIN_VARIANT = "scalar_rgb"
+_Item = TypeVar("_Item")
 
 
 @lru_cache(maxsize=1)
@@ -42,6 +45,32 @@ def load_mitsuba() -> ModuleType:
         if reason:
             warnings.warn(f"Mitsuba runs on {variant}, without depth, uv and triangle images: {reason}", stacklevel=2)
     return mitsuba
+
+
+@contextmanager
+def keeping_variant() -> Iterator[None]:
+    """Mitsuba's variant afterwards is what it was before, if the caller had chosen one; also a decorator.
+
+    The variant belongs to the whole process: a caller's own scene would stop rendering on another one.
+    """
+    before = sys.modules["mitsuba"].variant() if "mitsuba" in sys.modules else None
+    try:
+        yield
+    finally:
+        if before is not None and (mitsuba := sys.modules["mitsuba"]).variant() != before:
+            mitsuba.set_variant(before)
+
+
+def step_by_step(items: Iterator[_Item]) -> Iterator[_Item]:
+    """The same items; each is made with this project's variant, and handed out with the caller's."""
+    while True:
+        with keeping_variant():
+            load_mitsuba()
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+        yield item
 
 
 @contextmanager

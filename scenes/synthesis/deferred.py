@@ -21,7 +21,7 @@ from scenes.people.glasses import Glasses, glasses_topology
 from scenes.synthesis.launch import Launch, launches
 from scenes.synthesis.shading import encode_srgb, highlight, pixel_pattern
 from scenes.synthesis.vertex_light import gather_light, require_fast
-from scenes.variant import load_mitsuba
+from scenes.variant import keeping_variant, load_mitsuba, step_by_step
 from uika.head import Camera, HeadModel, vertex_normals
 
 LABELS = ("uv", "depth", "normal", "triangle")
@@ -43,6 +43,7 @@ class StoredView:
 class Shader:
     """One lit pose, ready to be seen from any camera."""
 
+    @keeping_variant()
     def __init__(
         self,
         head_scene: HeadScene,
@@ -104,6 +105,7 @@ class Shader:
         self._corner = mi.Float(flat(corner))
         self._faces = mi.UInt32(flat(faces))
 
+    @keeping_variant()
     def view(self, camera: Camera, spp: int = 4, labels: Sequence[str] = ("uv",)) -> dict[str, np.ndarray]:
         """See the pose from one camera.
 
@@ -140,6 +142,11 @@ class Shader:
             unit: metres of one step of a stored depth.
             spp: rays per pixel for colour and mask; 1, 4 or 16.
         """
+        return step_by_step(self._stored_views(cameras, backdrops, steps, unit, spp))
+
+    def _stored_views(
+        self, cameras: Sequence[Camera], backdrops: Sequence[np.ndarray], steps: int, unit: float, spp: int
+    ) -> Iterator[StoredView]:
         mi = load_mitsuba()
         import drjit as dr
 
@@ -237,6 +244,7 @@ def _labels(
     return layers
 
 
+@keeping_variant()
 def as_texture(albedo: np.ndarray, roughness: np.ndarray) -> Any:
     """A device texture of linear colour [S,S,3] and roughness [S,S], row 0 at v = 0."""
     mi = load_mitsuba()

@@ -11,12 +11,13 @@ import torch
 from scenes.arrays import flat
 from scenes.head_scene import HeadScene, Light, load_head_scene
 from scenes.synthesis.shading import plane_points
-from scenes.variant import FAST_VARIANT, load_mitsuba
+from scenes.variant import FAST_VARIANT, keeping_variant, load_mitsuba
 from uika.head import HeadModel, vertex_normals
 
 _LIFT = 3e-4  # metres, from the vertex to the point that is lit: clear of its own triangles
 
 
+@keeping_variant()
 def lit_scene(head: HeadModel, light: Light) -> HeadScene:
     """A scene for `Shader`, which needs no image size, with the lamps of the scene file."""
     head_scene = _used_scene(head, light)
@@ -38,6 +39,7 @@ def _used_scene(head: HeadModel, light: Light) -> HeadScene:
     return head_scene
 
 
+@keeping_variant()
 def gather_light(
     head_scene: HeadScene, points: torch.Tensor, normals: torch.Tensor, samples: int, seed: int
 ) -> np.ndarray:

@@ -14,13 +14,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-# Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# numpy is used for many small products only, which its threads would slow down.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 from uika.errors import UikaError, UikaWarning, install_command
 
+HEAD_VARIABLE = "UIKA_HEAD"
 _WRONG_INPUT, _UNEXPECTED, _INTERRUPTED = 2, 1, 130
 _PATIENCE = 1.5  # seconds from an interrupt to the end
 _said = threading.Event()
@@ -40,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     _said.clear()
+    chosen_head = os.environ.get(HEAD_VARIABLE)
     try:
         arguments = _choose_head([argument for argument in arguments if argument != "--debug"])
         if arguments in ([], ["-h"], ["--help"]):
@@ -61,10 +58,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = "" if code == _WRONG_INPUT or debug else " (--debug shows where)"
         print(f"uika: {sentence}{hint}", file=sys.stderr)
         return code
+    finally:
+        _set_head(chosen_head)
 
 
 def run() -> NoReturn:
     """Run one command as the process, and end the process with its exit code; an interrupt ends it within seconds."""
+    # Idle OpenMP threads would spin on the cores that Dr.Jit needs; read once, when torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # numpy is used for many small products only, which its threads would slow down.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _watch_for_interrupts()
     _is_process.set()
     sys.exit(main())
@@ -129,8 +132,15 @@ def _choose_head(arguments: list[str]) -> list[str]:
     at = arguments.index("--head")
     if at + 1 == len(arguments):
         raise UikaError("--head needs the head file to use, for example: --head flame.npz")
-    os.environ["UIKA_HEAD"] = arguments[at + 1]
+    _set_head(arguments[at + 1])
     return arguments[:at] + arguments[at + 2 :]
+
+
+def _set_head(path: str | None) -> None:
+    if path is None:
+        os.environ.pop(HEAD_VARIABLE, None)
+    else:
+        os.environ[HEAD_VARIABLE] = path
 
 
 def _overview(asked: bool) -> int:

@@ -264,8 +264,9 @@ def _networks(preset: str, model: str | Path | None, estimator: bool) -> tuple[R
         return load_checkpoint(model), None
     network = build(preset).eval()
     perturb_weights(network)
-    torch.manual_seed(0)
-    return network, Estimator(ESTIMATORS[preset]).eval() if estimator else None
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return network, Estimator(ESTIMATORS[preset]).eval() if estimator else None
 
 
 def in_order(rows: Iterable[Figures]) -> list[Figures]:

@@ -75,7 +75,7 @@ def load_checkpoint(path: str | Path) -> Reconstructor:
         raise CheckpointError(f"{path}: no such model file")
     config, tensors = _read(path)
     try:
-        with _Uninitialised():
+        with torch.random.fork_rng(devices=[]), _Uninitialised():
             model = Reconstructor(config)
     except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise CheckpointError(f"{path}: its config describes no model ({error})") from error

@@ -19,9 +19,13 @@ from uika.photo.lens import focal_length
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 512 * 1024 * 1024
 MIN_SIDE = 64
-FORMATS = ("JPEG", "PNG", "WEBP", "HEIF")
+FORMATS = ("JPEG", "PNG", "WEBP")
 KINDS = "JPEG, PNG, WebP or HEIC"
 _FILTERS = threading.Lock()  # the filters of warnings are the whole process's
+
+
+class _NoHeifError(Exception):
+    """A HEIC file, and no package that reads it."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +79,8 @@ def _read_bytes(path: Path) -> bytes:
 def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, float | None]:
     from PIL import Image, ImageOps, UnidentifiedImageError
 
-    formats = FORMATS if _register_heif() else FORMATS[:-1]
     try:
-        with Image.open(io.BytesIO(data), formats=formats) as image:
+        with _open(data) as image:
             _check_size(path, *image.size)
             image.load()
             focal = focal_length(image)
@@ -87,9 +90,9 @@ def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[n
         raise
     except Image.DecompressionBombError as error:
         raise PhotoError(path, f"has more than {MAX_PIXELS // 10**6} megapixels; save a smaller copy") from error
+    except _NoHeifError as error:
+        raise PhotoError(path, "looks like HEIC; install pillow-heif (pip install 'uika-drjit[photo]')") from error
     except UnidentifiedImageError as error:
-        if data[4:8] == b"ftyp" and "HEIF" not in formats:
-            raise PhotoError(path, "looks like HEIC; install pillow-heif (pip install 'uika-drjit[photo]')") from error
         raise PhotoError(path, f"is not a readable photo; save it as {KINDS}") from error
     except Exception as error:  # decoders meet hostile bytes with many exception types
         raise PhotoError(path, f"is damaged or cut short ({error}); copy or export it again") from error
@@ -103,13 +106,20 @@ def _check_size(path: str | Path, width: int, height: int) -> None:
         raise PhotoError(path, f"is only {width}x{height} px; use a photo of at least {MIN_SIDE} px on each side")
 
 
-def _register_heif() -> bool:
+def _open(data: bytes) -> Any:
+    """An opened Pillow image; HEIC is read without making it known to the Pillow of the caller's program."""
+    from PIL import Image, UnidentifiedImageError
+
     try:
-        import pillow_heif
-    except ImportError:
-        return False
-    pillow_heif.register_heif_opener()
-    return True
+        return Image.open(io.BytesIO(data), formats=FORMATS)
+    except UnidentifiedImageError:
+        if data[4:8] != b"ftyp":
+            raise
+    try:
+        from pillow_heif import HeifImageFile
+    except ImportError as error:
+        raise _NoHeifError from error
+    return HeifImageFile(io.BytesIO(data))
 
 
 def _to_arrays(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
