@@ -44,3 +44,33 @@ except RuntimeError as error:
     assert result.returncode == 0, result.stderr
     assert "scalar_rgb 1.0 1" in result.stdout
     assert "install LLVM" in result.stdout
+
+
+def test_the_callers_variant_is_kept_and_its_scene_still_renders() -> None:
+    code = """
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+mine = mi.load_dict(mi.cornell_box() | {"sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8,
+                                                                                    "height": 8}}})
+import drjit as dr, numpy as np
+import scenes
+from scenes.head_scene import load_head_scene
+from scenes.synthesis.deferred import Shader, as_texture
+from scenes.synthesis.vertex_light import gather_light, lit_scene
+from scenes.variant import step_by_step
+from tests.heads import sphere_head
+from uika.head import look_at, vertex_normals
+head, camera = sphere_head(), look_at(distance=0.8, size=16)
+first, threads, seen = np.array(mi.render(mine, spp=1)), dr.thread_count(), []
+scenes.render(head.template, head, camera, spp=1); seen.append(mi.variant())
+scenes.register_plugins(); seen.append(mi.variant())
+scene = lit_scene(head, "studio"); seen.append(mi.variant())
+scene.pose(head, head.template); seen.append(mi.variant())
+gather_light(scene, head.template, vertex_normals(head.template, head.faces), 4, 0); seen.append(mi.variant())
+as_texture(np.full((4, 4, 3), 0.5), np.full((4, 4), 0.5)); seen.append(mi.variant())
+seen += [mi.variant() for inside in step_by_step(mi.variant() for _ in range(2)) if inside == "llvm_ad_rgb"]
+print(seen == 8 * ["scalar_rgb"], threads == dr.thread_count(), np.array_equal(first, np.array(mi.render(mine, spp=1))))
+"""
+    result = run(code)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "True True True", result.stdout
