@@ -11,6 +11,7 @@ import pytest
 import uika
 from tests.avatars import painted_avatar
 from tests.spoken import SENTENCE, spoken, write_wav
+from uika.assets import PORTRAIT
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -23,9 +24,8 @@ BLOCKS = [
 
 @pytest.mark.parametrize("block", BLOCKS)
 def test_python_blocks_run(block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    portrait = Path(uika.__file__).parent / "assets" / "portrait.jpg"
     for name in ("front.jpg", "side.jpg"):
-        shutil.copy(portrait, tmp_path / name)
+        shutil.copy(PORTRAIT, tmp_path / name)
     painted_avatar(uika.load_head(), 32).save(tmp_path / "me.safetensors")
     write_wav(tmp_path / "voice.wav", spoken(SENTENCE).samples)
     monkeypatch.chdir(tmp_path)

@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 
 import drjit_splat.cli
-import uika
 from tests.documented import PAGES, ROOT, examples, mentioned, shown
 from tests.filmed import act
 from tests.spoken import SENTENCE, spoken, write_wav
 from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
+from uika.assets import PORTRAIT
 from uika.cli.program import _parse, main
 from uika.export import posed_splats, write_ply
 from uika.safeguards import mark, picture_provenance
@@ -73,11 +73,10 @@ def _understood(arguments: list[str]) -> bool:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with everything that the commands take."""
     place = tmp_path_factory.mktemp("shown")
-    portrait = Path(uika.__file__).parent / "assets" / "portrait.jpg"
     for name in ("front.jpg", "side.jpg", "me.jpg"):
-        shutil.copy(portrait, place / name)
+        shutil.copy(PORTRAIT, place / name)
     head = load_head()
-    avatar: Avatar = reconstruct([portrait], head, model="none").avatar
+    avatar: Avatar = reconstruct([PORTRAIT], head, model="none").avatar
     avatar.save(place / "me.safetensors")
     rest, camera = HeadParameters.zeros(head), neutral_camera(avatar, size=256)
     picture = mark(render(avatar, rest, camera, head).rgb)

@@ -19,6 +19,7 @@ from PIL import Image
 from safetensors import safe_open
 
 from tests.avatars import painted_avatar
+from uika.assets import PORTRAIT
 from uika.head import load_head
 from uika.tracking.decode import decode
 
@@ -26,7 +27,6 @@ from .conftest import LONG, Worst
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="skipped: needs Linux")]
 STOPS = int(os.environ.get("UIKA_STOPS", 6 if LONG else 1))
-PHOTO = Path(__file__).resolve().parents[2] / "uika" / "assets" / "portrait.jpg"
 # Words of each command, and the seconds within which it is stopped.
 COMMANDS = {
     "animate": (("animate", "{avatar}", "--motion", "orbit", "-o", "out/a.mp4", "--size", "128"), 6),
@@ -51,7 +51,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     painted_avatar(load_head()).save(avatar)
     words = ("synthesize", "-o", "people", "--identities", "2", "--size", "64", "--no-archives")
     subprocess.run(command(*words), cwd=folder, check=True, capture_output=True)
-    return {"avatar": avatar, "photo": PHOTO, "people": folder / "people"}
+    return {"avatar": avatar, "photo": PORTRAIT, "people": folder / "people"}
 
 
 def words_of(name: str, places: dict[str, Path]) -> list[str]:

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from drjit_splat.constants import SH_C0
 from uika.errors import UikaError
 from uika.export.glb import FLOAT, VERTICES, WIDTHS, Glb, read_parts
 from uika.export.splats import Splats
 from uika.io.files import check_output
 
 EXTENSION = "KHR_gaussian_splatting"
-_C0 = 0.28209479177387814  # the constant spherical harmonic
 _POINTS = 0  # mode of a primitive
 _NAMES = {
     "means": "POSITION",
@@ -49,7 +49,7 @@ def write_glb(path: str | Path, splats: Splats, provenance: Mapping[str, str] | 
         _NAMES["quats"]: wxyz.roll(-1, -1).numpy(),
         _NAMES["scales"]: splats.scales.numpy(),
         _NAMES["opacities"]: splats.opacities.numpy(),
-        _NAMES["harmonics"]: ((splats.colors - 0.5) / _C0).numpy(),
+        _NAMES["harmonics"]: ((splats.colors - 0.5) / SH_C0).numpy(),
         "COLOR_0": (points * 255).round().byte().numpy(),
     }
     file = Glb(provenance)
@@ -93,7 +93,7 @@ def read_glb(path: str | Path) -> Splats:
         if isinstance(error, UikaError):
             raise
         raise UikaError(f"{source}: has Gaussians that cannot be read ({error})") from error
-    colors = 0.5 + _C0 * read["harmonics"]
+    colors = 0.5 + SH_C0 * read["harmonics"]
     return Splats(read["means"], read["quats"].roll(1, -1), read["scales"], read["opacities"][:, 0], colors)
 
 

@@ -13,6 +13,7 @@ from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.export.splats import Splats, posed_splats
 from uika.head import HeadModel
+from uika.head.rotations import matrices_to_quaternions, multiply_quaternions
 from uika.io.files import check_folder, check_output, replacing
 from uika.io.progress import counted
 from uika.motion import Motion
@@ -93,7 +94,7 @@ def write_bound_ply(path: str | Path, avatar: Avatar, head: HeadModel) -> Path |
     save_ply(
         target,
         local,
-        _multiply(_conjugate(_from_matrix(rotation))[avatar.triangle], avatar.quats),
+        multiply_quaternions(matrices_to_quaternions(rotation.mT)[avatar.triangle], avatar.quats),
         avatar.scales / length,
         avatar.opacities,
         avatar.colors,
@@ -128,25 +129,3 @@ def _write_flame(target: Path, avatar: Avatar, head: HeadModel) -> Path:
     with replacing(beside) as temporary, temporary.open("wb") as file:
         np.savez(file, shape=shape, static_offset=avatar.static_offset.numpy()[None], **arrays)  # type: ignore[arg-type]
     return beside
-
-
-def _from_matrix(rotation: Tensor) -> Tensor:
-    """Quaternions [N,4] (wxyz) of rotations [N,3,3]: the main eigenvector of Bar-Itzhack's symmetric matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.double().unbind(-2))
-    rows = (a + e + i, h - f, c - g, d - b, a - e - i, b + d, c + g, e - a - i, f + h, i - a - e)
-    matrix = torch.zeros(len(rotation), 4, 4, dtype=torch.float64)
-    upper = torch.triu_indices(4, 4)
-    matrix[:, upper[0], upper[1]] = torch.stack(rows, -1)
-    matrix[:, upper[1], upper[0]] = torch.stack(rows, -1)
-    return torch.linalg.eigh(matrix).eigenvectors[..., -1].float()
-
-
-def _conjugate(quats: Tensor) -> Tensor:
-    return quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
-
-
-def _multiply(one: Tensor, other: Tensor) -> Tensor:
-    """Hamilton products [N,4], wxyz."""
-    a, b = one[:, :1], one[:, 1:]
-    c, d = other[:, :1], other[:, 1:]
-    return torch.cat((a * c - (b * d).sum(-1, keepdim=True), a * d + c * b + torch.linalg.cross(b, d)), -1)

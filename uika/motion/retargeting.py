@@ -14,7 +14,7 @@ from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.head.landmark_model import FrameModel, Pose, bounded_step, frame_model, head_landmarks, landmark_jacobian
 from uika.motion.motion import Motion, MotionError
 
-LANDMARK_NOISE = 5e-4  # metres; weighs the landmarks against the prior of 1 on each squared coefficient
+LANDMARK_NOISE_METRES = 5e-4  # between meshes; against the prior of 1 on each squared coefficient
 MIN_SHARED = 50  # landmarks
 JOINT_PRIOR = (1.0, 1.0, 100.0)  # per squared radian about x, y and z
 STEPS = 4
@@ -100,7 +100,7 @@ def _solve(model: FrameModel, wanted: Array, start: Pose) -> Pose:
     for _ in range(STEPS):
         residual = head_landmarks(model, pose) - wanted
         jacobian = landmark_jacobian(model, pose)
-        root = np.sqrt(model.weight)[:, None] / LANDMARK_NOISE
+        root = np.sqrt(model.weight)[:, None] / LANDMARK_NOISE_METRES
         rows = (jacobian * root[..., None]).reshape(-1, jacobian.shape[-1])
         joint_values = np.concatenate([axis_angle(turn) for turn in pose.joints]) if len(pose.joints) else np.zeros(0)
         prior = np.concatenate((np.ones(E), np.tile(JOINT_PRIOR, len(pose.joints))))
