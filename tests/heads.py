@@ -1,14 +1,12 @@
 """A small synthetic head for tests: an ellipsoid with a UV seam, random bases and five joints."""
 
 import math
-from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
 
+from tests.recorded import PARITY
 from uika.head import HeadModel
-
-PARITY = Path(__file__).resolve().parents[2] / "shared" / "parity"
 
 
 def sphere_head(rows: int = 16, columns: int = 24, identities: int = 4, expressions: int = 3) -> HeadModel:

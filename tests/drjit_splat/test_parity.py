@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from safetensors.torch import load_file
 
 from drjit_splat import rasterization
+from tests.recorded import PARITY, recorded
 
-FILE = Path(__file__).parents[3] / "shared" / "parity" / "raster_derived.safetensors"
-
-pytestmark = pytest.mark.skipif(not FILE.exists(), reason="skipped: no recorded outputs beside the checkout")
+FILE = PARITY / "raster_derived.safetensors"
+pytestmark = recorded
 
 
 @pytest.mark.parametrize("camera", ["centred", "offcentre"])

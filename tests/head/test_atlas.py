@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from tests.heads import PARITY, released_parity
+from tests.heads import released_parity
+from tests.recorded import recorded
 from uika.head import HeadModel, HeadParameters, skin_points, surface_points, uv_texels
 
 
@@ -45,7 +46,7 @@ def test_unknown_rule_is_refused(head: HeadModel) -> None:
         uv_texels(head, 8, "loose")  # type: ignore[arg-type]
 
 
-@pytest.mark.skipif(not PARITY.is_dir(), reason="skipped: no parity folder")
+@recorded
 def test_released_texels_and_gaussian_path() -> None:
     data, head = released_parity()
     binding = uv_texels(head, 40, "released")

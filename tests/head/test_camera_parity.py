@@ -1,16 +1,14 @@
 """Against recorded cameras of the released program (not part of the repository)."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.recorded import PARITY, recorded
 from uika.head import Camera, ellipse, project
 
-FILE = Path(__file__).parents[3] / "shared" / "parity" / "camera.safetensors"
-
-pytestmark = pytest.mark.skipif(not FILE.exists(), reason="skipped: no recorded outputs beside the checkout")
+FILE = PARITY / "camera.safetensors"
+pytestmark = recorded
 
 
 def test_views_and_pixels() -> None:

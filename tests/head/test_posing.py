@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from tests.heads import PARITY, released_parity
+from tests.heads import released_parity
+from tests.recorded import recorded
 from uika.head import (
     HeadModel,
     HeadParameters,
@@ -11,8 +12,6 @@ from uika.head import (
     shaped_vertices,
     vertex_normals,
 )
-
-needs_parity = pytest.mark.skipif(not PARITY.is_dir(), reason="skipped: no parity folder")
 
 
 def posed_parameters(head: HeadModel, batch: int = 4) -> HeadParameters:
@@ -93,7 +92,7 @@ def test_vertex_normals_point_outwards(head: HeadModel) -> None:
     assert float((normals * radial).sum(-1).min()) > 0.99
 
 
-@needs_parity
+@recorded
 def test_released_vertex_path() -> None:
     data, head = released_parity()
     params = HeadParameters(
@@ -104,7 +103,7 @@ def test_released_vertex_path() -> None:
     torch.testing.assert_close(head.landmarks(vertices), data["out/mesh_landmarks"], atol=1e-6, rtol=0)
 
 
-@needs_parity
+@recorded
 def test_released_joint_transforms() -> None:
     data, head = released_parity()
     names = ("expr", "rotation", "neck", "jaw", "eyes")

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from tests.recorded import PARITY
+from tests.recorded import recorded as recorded_outputs
 from uika.model import PRESETS, BackboneConfig, EstimatorConfig, Reconstructor
 from uika.model.backbone import VisionTransformer
 from uika.model.estimator import Aggregator
@@ -16,9 +17,7 @@ from uika.model.fusion import Encoder
 from uika.model.mm_block import MMBlock
 from uika.model.uv_head import UvHead
 
-PARITY = Path(__file__).parents[3] / "shared" / "parity"
-
-pytestmark = pytest.mark.skipif(not PARITY.exists(), reason="skipped: no recorded outputs beside the checkout")
+pytestmark = recorded_outputs
 
 TOLERANCE = {"rtol": 0.0, "atol": 5e-5}
 # Weights of the released model that no output depends on.

@@ -1,16 +1,12 @@
 """Losses against recorded values of the released code and by their own meaning."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.recorded import PARITY, recorded
 from uika.metrics.structural_similarity import ssim_map
 from uika.train.losses import gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
-
-PARITY = Path(__file__).parents[2] / "shared" / "parity"
-recorded = pytest.mark.skipif(not PARITY.exists(), reason="skipped: no recorded outputs beside the checkout")
 
 
 @recorded

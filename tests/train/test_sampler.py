@@ -1,16 +1,13 @@
 """Which heads a step gets, the batch rule and the learning rate."""
 
 from itertools import islice
-from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.recorded import PARITY, recorded
 from uika.train import Sampler, SamplerConfig, batch_size, learning_rate
-
-PARITY = Path(__file__).parents[3] / "shared" / "parity"
-recorded = pytest.mark.skipif(not PARITY.exists(), reason="skipped: no recorded outputs beside the checkout")
 
 
 @recorded

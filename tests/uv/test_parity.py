@@ -1,16 +1,14 @@
 """Against recorded outputs of the released reprojection (not part of the repository)."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.recorded import PARITY, recorded
 from uika.uv import aggregate, reproject
 
-FILE = Path(__file__).parents[3] / "shared" / "parity" / "uv_reproject.safetensors"
-
-pytestmark = pytest.mark.skipif(not FILE.exists(), reason="skipped: no recorded outputs beside the checkout")
+FILE = PARITY / "uv_reproject.safetensors"
+pytestmark = recorded
 
 
 @pytest.fixture(scope="module")
