@@ -26,7 +26,7 @@ INPUTS = ("means", "quats", "scales", "opacities", "colors")
 def large(scene: Scene) -> dict[str, object]:
     """Image and gradient errors of one large scene."""
     single = [t.clone().requires_grad_() for t in scene.tensors[:5]]
-    image, alpha, meta = rasterization(*single, *scene.tensors[5:], scene.size, scene.size)
+    image, alpha, meta = rasterization(*single, *scene.tensors[5:], scene.size, scene.size, packed=False)
     double = [t.double().requires_grad_() for t in scene.tensors[:5]]
     exact = pair_oracle.render(scene, double, meta["depths"][0])
     trusted = exact.margin > MARGIN
@@ -65,7 +65,7 @@ def small(count: int) -> list[dict[str, object]]:
 def skipping(scene: Scene) -> dict[str, object]:
     """The default thresholds against none at all."""
     with torch.no_grad():
-        image, _, meta = rasterization(*scene.tensors, scene.size, scene.size)
+        image, _, meta = rasterization(*scene.tensors, scene.size, scene.size, packed=False)
         exact = pair_oracle.render(scene, [t.double() for t in scene.tensors[:5]], meta["depths"][0], skips=False)
     error = (image[0] - exact.image).abs()
     return {

@@ -139,7 +139,7 @@ def measure(name: str, repeats: int) -> list[dict[str, object]]:
     leaves = [t.clone().requires_grad_() for t in scene.tensors[:5]]
     weight = torch.rand(scene.size, scene.size, 3, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        meta = rasterization(*scene.tensors, scene.size, scene.size)[2]
+        meta = rasterization(*scene.tensors, scene.size, scene.size, packed=False)[2]
         exact = pair_oracle.render(scene, [t.double() for t in scene.tensors[:5]], meta["depths"][0], skips=False).image
 
     def both(options: Options) -> None:
@@ -152,7 +152,7 @@ def measure(name: str, repeats: int) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     for (group, label), options in settings.items():
         with torch.no_grad():
-            image, _, meta = rasterization(*scene.tensors, scene.size, scene.size, options=options)
+            image, _, meta = rasterization(*scene.tensors, scene.size, scene.size, packed=False, options=options)
         error = (image[0] - exact).abs()
         timing = times[f"{group}: {label}"]
         rows.append(

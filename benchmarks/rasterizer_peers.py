@@ -149,7 +149,7 @@ def measure(name: str, repeats: int) -> list[dict[str, object]]:
     """A row for each implementation."""
     scene = named_scene(name)
     with torch.no_grad():
-        depths = rasterization(*scene.tensors, scene.size, scene.size)[2]["depths"][0]
+        depths = rasterization(*scene.tensors, scene.size, scene.size, packed=False)[2]["depths"][0]
     double = [t.double().requires_grad_() for t in scene.tensors[:5]]
     exact = pair_oracle.render(scene, double, depths)
     trusted = exact.margin > MARGIN

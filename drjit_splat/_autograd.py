@@ -1,7 +1,14 @@
-"""One camera's image as one node of torch's autograd graph."""
+"""One call as two nodes of torch's autograd graph: splats -> means on the images -> images.
+
+Both are computed at once, and so are their adjoints: what passes between them on the way back is a note where to find
+the result. Only when somebody has looked at the means (or conics, depths) in between are they and their gradients
+written out, so that the graph is as gsplat's and costs nothing.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -9,116 +16,220 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
-from ._backend import Backend, backend_of, exclusive, flat
+from ._backend import Backend, backend_of, exclusive
+from ._bridge import cross
+from ._gradients import (
+    INPUTS,
+    PER_SPLAT,
+    arrays_of,
+    blend_gradients,
+    given_gradients,
+    output_gradients,
+    sparse_rows,
+    summed,
+)
 from ._inputs import check_finite
-from ._project import Arrays
 from ._settings import Settings
-
-INPUTS = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks")
-
-
-def arrays_of(be: Backend, inputs: tuple[Tensor | None, ...]) -> Arrays:
-    """Contiguous float32 tensors in the order of `INPUTS`, without copies."""
-    means, quats, scales, covars, opacities, colors, view, K = (
-        None if t is None else flat(be.plain.Float, t) for t in inputs
-    )
-    assert inputs[0] is not None and inputs[5] is not None
-    return Arrays(len(inputs[0]), inputs[5].shape[1], means, quats, scales, covars, opacities, colors, view, K)
+from ._values import empty_outputs
 
 
-def image_of(trace: _core.Trace, features: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Sums [H, W, F] and coverage [H, W, 1] of a blended trace."""
-    height, width = trace.settings.height, trace.settings.width
-    if not trace.chunks:
-        return torch.zeros(height, width, features, device=device), torch.zeros(height, width, 1, device=device)
-    parts = [chunk.image.features.torch().view(height, width, chunk.count) for chunk in trace.chunks]
-    sums = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-    first = trace.chunks[0].image
-    covered = 1 - first.transmittance.torch() if first.coverage is None else first.coverage.torch()
-    return sums, covered.view(height, width, 1)
+@dataclass
+class Pending:
+    """What the second node's adjoint leaves for the first one's."""
+
+    task: int  # of the backward pass that left it
+    given: tuple[Tensor, ...]  # gradients that it passed on, of the means, conics and depths
+    inputs: list[Tensor | None]  # gradients of the first node's inputs, as far as they come by way of the images
 
 
-def split(be: Backend, trace: _core.Trace, gradient: Tensor) -> list[Any]:
-    """The chunks' shares of the gradient [H, W, F] of the sums."""
-    return [
-        flat(be.plain.Float, gradient[..., chunk.first : chunk.first + chunk.count].contiguous())
-        for chunk in trace.chunks
-    ]
+@dataclass
+class Call:
+    """What the two nodes of one call share. It must not keep their results, which would keep the graph alive."""
+
+    be: Backend
+    settings: Settings
+    batch: tuple[int, ...]  # sizes of the batch dimensions
+    cameras: int  # of each element of the batch
+    packed: bool = False
+    sparse: bool = False
+    absgrad: bool = False
+    wrapped: bool = False  # whether `dr.wrap` is the bridge
+    traces: list[_core.Trace] = field(default_factory=list)  # one an image
+    asked: tuple[bool, ...] = ()  # which inputs of the first node want gradients
+    looked: set[str] = field(default_factory=set)  # names of the results in between that somebody has seen
+    images: tuple[Tensor, Tensor] | None = None  # sums and coverage, on their way to the second node
+    pending: Pending | None = None
+
+    @property
+    def batches(self) -> int:
+        """Number of elements of the batch."""
+        return math.prod(self.batch)
+
+    @property
+    def count(self) -> int:
+        """Number of images."""
+        return self.batches * self.cameras
+
+    def of_image(self, tensors: tuple[Tensor | None, ...], i: int) -> list[Tensor | None]:
+        """Those of the first node's inputs that make image `i`."""
+        first = PER_SPLAT * (i // self.cameras)
+        views, Ks, radial = tensors[PER_SPLAT * self.batches :]
+        assert views is not None and Ks is not None
+        cameras = (views[i], Ks[i], None if radial is None else radial[i])
+        return [*tensors[first : first + PER_SPLAT], *cameras]
 
 
-def render(inputs: tuple[Tensor | None, ...], settings: Settings) -> _core.Trace:
-    """Trace of one image; `inputs` are contiguous float32 in the order of `INPUTS`.
+def _contiguous(tensors: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+    return tuple(None if t is None else t.detach().contiguous() for t in tensors)
+
+
+def render(call: Call, inputs: tuple[Tensor | None, ...], colors: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Sums [I, H, W, F] and coverage [I, H, W, 1] of all images; fills `call.traces`.
 
     Raises:
         ValueError: a value that the projection reads is not finite.
     """
-    assert inputs[0] is not None and inputs[5] is not None
-    be = backend_of(inputs[0].device)
-    if len(inputs[0]) == 0:
-        return _core.Trace(be, settings)
-    arrays = arrays_of(be, inputs)
-    features = arrays.columns + int(settings.has_depth)
-    trace = _core.geometry(be, arrays, settings, features)
-    if trace.projected is not None and trace.projected.nonfinite:
-        check_finite(**{k: t for k, t in zip(INPUTS, inputs, strict=True) if t is not None})
-    if trace.lists is not None:
-        _core.shade(trace, arrays.colors, arrays.columns, features)
-    return trace
+    s = call.settings
+    sums, coverages = [], []
+    for i in range(call.count):
+        tensors = call.of_image(inputs, i)
+        trace = _core.Trace(call.be, s)
+        call.traces.append(trace)
+        features = colors[i].shape[1] + int(s.has_depth)
+        n, columns = colors[i].shape
+        if n:
+            found = cross(
+                call.be,
+                lambda be, *arrays, trace=trace, n=n, columns=columns: _core.render(
+                    trace, arrays_of(n, columns, arrays)
+                ),
+                [*tensors, colors[i] if columns else None],
+                call.wrapped,
+            )
+            if trace.projected is not None and trace.projected.nonfinite:
+                named = zip(INPUTS, [*tensors, colors[i]], strict=True)
+                check_finite(**{name: t for name, t in named if t is not None})
+        if trace.lists is None:
+            sums.append(colors[i].new_zeros(s.height, s.width, features))
+            coverages.append(colors[i].new_zeros(s.height, s.width, 1))
+            continue
+        *chunks, coverage = found
+        parts = [part.view(s.height, s.width, -1) for part in chunks if part is not None]
+        assert coverage is not None
+        sums.append(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
+        coverages.append(coverage.view(s.height, s.width, 1))
+    return stack(sums), stack(coverages)
 
 
-class Splat(torch.autograd.Function):
-    """The eight `INPUTS` -> sums, coverage.
+def stack(parts: list[Tensor]) -> Tensor:
+    """Images in one tensor, without a copy when there is one."""
+    return parts[0][None] if len(parts) == 1 else torch.stack(parts)
+
+
+class Project(torch.autograd.Function):
+    """For each element of the batch means, quats, scales, covars and opacities, then viewmats [I, 4, 4], Ks [I, 3, 3]
+    and lens coefficients -> means2d, conics and depths, whose values are written when somebody looks.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, colors: list[Tensor], *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        """Render; the images go to the second node by way of `call`."""
+        call.images = render(call, _contiguous(inputs), colors)
+        call.asked = ctx.needs_input_grad[2:]
+        ctx.call = call
+        ctx.columns = [c.shape[1] for c in colors]
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs)
+        return empty_outputs(call, colors[0].device, len(colors[0]))
+
+    @staticmethod
+    @once_differentiable
+    @exclusive
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Gradients of the inputs: those by way of the images, and those of what else depends on the results."""
+        call: Call = ctx.call
+        inputs = _contiguous(ctx.saved_tensors)
+        pending, call.pending = call.pending, None
+        if pending is not None and pending.task != torch._C._current_graph_task_id():
+            pending = None  # left by a pass that never came here
+        found: list[Tensor | None] = [None] * len(inputs) if pending is None else pending.inputs
+        extra: list[Tensor | None] = []
+        for k, gradient in enumerate(gradients):
+            given = None if pending is None else pending.given[k]
+            if gradient is None or (given is not None and gradient.data_ptr() == given.data_ptr()):
+                extra.append(None)
+            else:
+                extra.append(gradient if given is None else gradient - given)
+        if any(e is not None for e in extra):
+            found = summed(found, output_gradients(call, inputs, ctx.columns, extra))
+        if call.sparse:
+            found = sparse_rows(call, found)
+        asked = ctx.needs_input_grad[2:]
+        return (None, None, *(g if w else None for g, w in zip(found, asked, strict=True)))
+
+
+class Composite(torch.autograd.Function):
+    """means2d, conics, depths and the colours of each image -> sums [I, H, W, F], coverage [I, H, W, 1].
 
     The kernels on both sides carry no gradients of their own: backward reads what forward saved, so it may run twice
     (`retain_graph`), and tensors edited in between are noticed by their version counters.
     """
 
     @staticmethod
-    def forward(ctx: Any, settings: Settings, holder: list[_core.Trace], *inputs: Tensor | None) -> tuple[Tensor, ...]:
-        """Render; `holder` receives the trace."""
-        plain = tuple(None if t is None else t.detach().contiguous() for t in inputs)
-        trace = render(plain, settings)
-        holder.append(trace)
-        assert plain[0] is not None and plain[5] is not None
-        sums, coverage = image_of(trace, plain[5].shape[1] + int(settings.has_depth), plain[0].device)
-        ctx.trace = trace
-        ctx.save_for_backward(*inputs, sums, coverage)
+    def forward(
+        ctx: Any,
+        call: Call,
+        inputs: tuple[Tensor | None, ...],
+        means2d: Tensor,
+        conics: Tensor,
+        depths: Tensor,
+        *colors: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """The images that the first node has made; `inputs` are that node's."""
+        assert call.images is not None
+        (sums, coverage), call.images = call.images, None
+        ctx.call = call
+        ctx.means2d = means2d if call.absgrad else None
+        ctx.shapes = (means2d.shape, conics.shape, depths.shape)
+        ctx.save_for_backward(*(None if t is None else t.detach() for t in inputs), *colors, sums, coverage)
         return sums, coverage
 
     @staticmethod
     @once_differentiable
     @exclusive
     def backward(ctx: Any, grad_sums: Tensor, grad_coverage: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of the eight tensors."""
-        saved = tuple(None if t is None else t.detach().contiguous() for t in ctx.saved_tensors[:8])
-        trace: _core.Trace = ctx.trace
-        asked = ctx.needs_input_grad[2:]
-        if trace.lists is None:
-            zeros = (torch.zeros_like(t) if w and t is not None else None for t, w in zip(saved, asked, strict=True))
-            return (None, None, *zeros)
-        arrays = arrays_of(trace.be, saved)
-        wanted = _core.Wanted(any(asked[:4]), asked[4], asked[5], asked[6] or asked[7])
-        g = _core.backward(
-            trace,
-            arrays,
-            split(trace.be, trace, grad_sums.contiguous()),
-            flat(trace.be.plain.Float, grad_coverage.contiguous()),
-            wanted,
+        """Gradients of the colours; those of the splats wait in `call.pending` for the first node."""
+        call: Call = ctx.call
+        saved = _contiguous(ctx.saved_tensors[:-2])
+        inputs, colors = saved[: -call.count], saved[-call.count :]
+        through, colors_asked = ctx.needs_input_grad[2], ctx.needs_input_grad[5:]
+        asked = call.asked if through else (False,) * len(inputs)
+        result = blend_gradients(
+            call, inputs, colors, asked, any(colors_asked), grad_sums.contiguous(), grad_coverage.contiguous()
         )
-        view, K = (None, None) if g.inputs.camera is None else _camera(g.inputs.camera.torch().view(arrays.count, -1))
-        found = (g.inputs.means, g.inputs.quats, g.inputs.scales, g.inputs.covars, g.inputs.opacities, g.colors)
-        tensors = [None if a is None else a.torch() for a in found] + [view, K]
-        shaped = (
-            None if t is None or source is None or not w else t.view(source.shape)
-            for t, source, w in zip(tensors, saved, asked, strict=True)
-        )
-        return (None, None, *shaped)
+        given: tuple[Tensor | None, ...] = (None, None, None)
+        if through:
+            written = given_gradients(call, ctx.shapes, result, grad_sums.device)
+            call.pending = Pending(torch._C._current_graph_task_id(), written, result.inputs)
+            given = written
+        if ctx.means2d is not None:
+            ctx.means2d.absgrad = result.absolute
+        wanted = (g if w else None for g, w in zip(result.colors, colors_asked, strict=True))
+        return (None, None, *given, *wanted)
 
 
-def _camera(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of the view matrix and of K from those of every splat [N, 16]."""
-    total = rows.sum(0, dtype=torch.float64).to(torch.float32)
-    fx, fy, cx, cy = total[12:]
-    zero = torch.zeros_like(fx)
-    view = torch.cat([total[:12], total.new_zeros(4)]).view(4, 4)
-    return view, torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, zero]).view(3, 3)
+def rasterize(call: Call, inputs: tuple[Tensor | None, ...], colors: list[Tensor]) -> tuple[Tensor, ...]:
+    """Sums, coverage and the results in between: means2d, conics, depths."""
+    between = Project.apply(call, [c.detach().contiguous() for c in colors], *inputs)
+    sums, coverage = Composite.apply(call, inputs, *between, *colors)
+    return sums, coverage, *between
+
+
+def call_for(device: torch.device, settings: Settings, batch: tuple[int, ...], cameras: int, **switches: Any) -> Call:
+    """A call whose tensors are on `device`.
+
+    Raises:
+        RuntimeError: no LLVM >= 16 (CPU) or no CUDA driver could be loaded.
+        ValueError: the device is neither a CPU nor a CUDA device.
+    """
+    return Call(backend_of(device), settings, batch, cameras, **switches)

@@ -25,7 +25,8 @@ from ._project import RECORD
 from ._settings import Settings
 
 UNROLL = 2  # see `_blend.UNROLL`; the adjoint of one entry is long enough to hide its gathers
-MOMENTS = 8  # sums of v, v s, v t, v s^2, v s t, v t^2 with v = alpha dL/dalpha, s = dx + h dy, t = dy; 2 spare
+MOMENTS = 8  # sums of v, v s, v t, v s^2, v s t, v t^2 with v = alpha dL/dalpha, s = dx + h dy, t = dy; then, if they
+# are asked for, of |v s| and |v (a h s + d t)|
 
 
 def blend_backward(
@@ -38,11 +39,12 @@ def blend_backward(
     grad_coverage: Any | None,  # [H * W]
     capacity: int,
     settings: Settings,
+    absolute: bool = False,
 ) -> Any:
     """One chunk's gradients [capacity * RECORD], `capacity` >= N, laid out like the records: a splat's moments and then
-    those of its features share a cache line.
+    those of its features share a cache line. `absolute` asks for the last two moments.
     """
-    key = (be, capacity, features, lists.columns, lists.rows, settings, dr.thread_count())
+    key = (be, capacity, features, lists.columns, lists.rows, settings, absolute, dr.thread_count())
     order = lane_order(be, lists.lengths(be, blended.end), lists.columns, lists.rows)
     image = (blended.features, blended.transmittance, blended.end)
     return _recorded(*key)(records, lists.ids, lists.start, order, *image, grad_features, grad_coverage)
@@ -50,7 +52,7 @@ def blend_backward(
 
 @lru_cache(maxsize=RECORDINGS)
 def _recorded(
-    be: Backend, capacity: int, features: int, columns: int, rows: int, settings: Settings, threads: int
+    be: Backend, capacity: int, features: int, columns: int, rows: int, settings: Settings, absolute: bool, threads: int
 ) -> Callable[..., Any]:
     """The kernel, traced at its first call; see `_blend._recorded`. Each thread adds to a copy of its own, so that the
     number of `threads` is part of the key.
@@ -62,7 +64,7 @@ def _recorded(
         gradients = dr.zeros(be.plain.Float, capacity * RECORD)
         lists = TileLists(ids, start, order, columns, rows, settings.options.list_width)
         blended = Blended(image, left, None, end)
-        _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings)
+        _add_gradients(be, records, lists, blended, features, grad, grad_left, gradients, settings, absolute)
         dr.eval(gradients)
         return gradients
 
@@ -79,6 +81,7 @@ def _add_gradients(
     grad_coverage: Any | None,
     gradients: Any,
     settings: Settings,
+    absolute: bool,
 ) -> None:
     """Add the gradients to those given.
 
@@ -139,7 +142,10 @@ def _add_gradients(
             # -------------------- Reduce over the tile and add to the splat's gradient --------------------
             blended_here = total > 0.0
             moments = _moments if uses_recurrence(settings) else _moments_pixel_by_pixel
-            add_packet(be, gradients, moments(J, slopes, geometry[3], s, t), 2 * splat, blended_here)
+            sums = moments(J, slopes, geometry[3], s, t)
+            if absolute:
+                sums[6:] = _absolute_moments(J, slopes, geometry, s, t)
+            add_packet(be, gradients, sums, 2 * splat, blended_here)
             padding = [J.Float(0)] * (padded - features)
             add_packet(be, gradients, by_value + padding, ratio * splat + ratio // 2, blended_here)
         return k + UNROLL, transmittances, behind
@@ -176,6 +182,18 @@ def _moments(J: Any, slopes: list[Any], h: Any, s: Any, t: Any) -> list[Any]:
         J.Float(0),
         J.Float(0),
     ]
+
+
+def _absolute_moments(J: Any, slopes: list[Any], geometry: list[Any], s: Any, t: Any) -> list[Any]:
+    """Sums of |v s| and |v (a h s + d t)|: what each pixel alone would move the mean by, up to a factor."""
+    _, _, a, h, d = geometry[:5]
+    by_x, by_y = J.Float(0), J.Float(0)
+    for k, v in enumerate(slopes):
+        row, column = divmod(k, TILE)
+        x, y = dr.fma(h, float(row), s + float(column)), t + float(row)
+        by_x += dr.abs(v * x)
+        by_y += dr.abs(v * dr.fma(a * h, x, d * y))
+    return [by_x, by_y]
 
 
 def _moments_pixel_by_pixel(J: Any, slopes: list[Any], h: Any, s: Any, t: Any) -> list[Any]:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
 
-from . import _binning, _project, _project_backward
+from . import _binning, _project
 from . import constants as c
 from ._backend import Backend, larger, packet, power_of_two, write, write_packet
 from ._blend import Blended, blend
 from ._blend_backward import blend_backward
 from ._project import RECORD, Arrays
+from ._project_backward import (
+    InputGradients,
+    OutputGradients,
+    opacity_adjoint,
+    output_gradients,
+    projection_adjoint,
+    seeds_of_moments,
+    seeds_of_outputs,
+)
 from ._settings import Settings
 from .profiling import stage
 
@@ -53,6 +62,24 @@ class Trace:
             empty: Any = dr.count(lengths == 0)
             found["empty_tiles"] = int(empty[0])
         return found
+
+    def image(self) -> list[Any]:
+        """Features [H * W * F] of every chunk, then the coverage [H * W]; nothing where nothing is visible."""
+        if not self.chunks:
+            return [None]
+        first = self.chunks[0].image
+        covered = 1 - first.transmittance if first.coverage is None else first.coverage
+        return [*(chunk.image.features for chunk in self.chunks), covered]
+
+
+def render(trace: Trace, arrays: Arrays) -> list[Any]:
+    """Render N >= 1 splats into an empty trace and return its image, unless `projected.nonfinite` says otherwise."""
+    features = arrays.columns + int(trace.settings.has_depth)
+    seen = geometry(trace.be, arrays, trace.settings, features)
+    trace.projected, trace.lists = seen.projected, seen.lists
+    if trace.lists is not None:
+        shade(trace, arrays.colors, arrays.columns, features)
+    return trace.image()
 
 
 def queue(be: Backend, arrays: Arrays, settings: Settings, features: int) -> _project.Queued:
@@ -119,14 +146,17 @@ class Wanted:
     opacities: bool
     colors: bool
     camera: bool
+    outputs: bool = False  # what the projection makes of the splats
+    absolute: bool = False  # the means' absolute gradients, added up pixel by pixel
 
 
 @dataclass(frozen=True)
 class Gradients:
     """Flat Dr.Jit arrays, None where nothing was asked for."""
 
-    inputs: _project_backward.InputGradients
+    inputs: InputGradients
     colors: Any | None  # [N * D]
+    outputs: OutputGradients = field(default_factory=OutputGradients)
 
 
 _capacities: set[int] = set()
@@ -162,7 +192,16 @@ def backward(
         with stage("blend backward"):
             coverage = grad_coverage if chunk.first == 0 else None
             target = blend_backward(
-                be, chunk.records, lists, chunk.image, chunk.count, gradient, coverage, capacity(n), trace.settings
+                be,
+                chunk.records,
+                lists,
+                chunk.image,
+                chunk.count,
+                gradient,
+                coverage,
+                capacity(n),
+                trace.settings,
+                wanted.absolute,
             )
         sums.append(target)
         size = power_of_two(chunk.count)
@@ -179,10 +218,24 @@ def backward(
     with stage("projection backward"):
         if wanted.shape or wanted.camera:
             camera = _project.read_camera(be, arrays, trace.settings)
-            inputs = _project_backward.projection_adjoint(
-                be, arrays, p.records, p.visible, sums, grad_depth, camera, trace.settings, wanted.camera
-            )
+            seeds = seeds_of_moments(be, p.records, sums, i)
+            inputs = projection_adjoint(be, arrays, p.visible, seeds, grad_depth, camera, trace.settings, wanted.camera)
         else:
-            inputs = _project_backward.opacity_adjoint(be, arrays.opacities, p.visible, sums, wanted.opacities)
+            inputs = opacity_adjoint(be, arrays.opacities, p.visible, sums, wanted.opacities)
         dr.eval(grad_colors)
-    return Gradients(inputs, grad_colors)
+    outputs = OutputGradients()
+    if wanted.outputs:
+        outputs = replace(output_gradients(be, p.records, p.visible, sums, False), depths=grad_depth)
+    if wanted.absolute:
+        outputs = replace(outputs, absolute=output_gradients(be, p.records, p.visible, sums, True).absolute)
+    return Gradients(inputs, grad_colors, outputs)
+
+
+def outputs_backward(trace: Trace, arrays: Arrays, given: OutputGradients, with_camera: bool) -> InputGradients:
+    """Gradients of the inputs from those of what the projection makes of N >= 1 splats."""
+    be, p = trace.be, trace.projected
+    assert p is not None
+    i = dr.arange(be.plain.UInt32, arrays.count)
+    camera = _project.read_camera(be, arrays, trace.settings)
+    seeds = seeds_of_outputs(be, p.records, given, i)
+    return projection_adjoint(be, arrays, p.visible, seeds, given.depths, camera, trace.settings, with_camera)

@@ -10,7 +10,8 @@ from typing import Any
 import drjit as dr
 
 from . import constants as c
-from ._backend import Backend, larger, smaller
+from ._backend import larger
+from ._lens import Camera, see
 from ._settings import Settings
 
 
@@ -21,20 +22,6 @@ class Shape:
     quat: list[Any]
     scale: list[Any]
     covariance: list[Any]  # the 9 entries, averaged across the diagonal
-
-
-@dataclass(frozen=True)
-class Camera:
-    """One pinhole camera as Dr.Jit registers; sizes and limits are opaque so that kernels are reused."""
-
-    view: list[Any]  # 12: rows of the world-to-camera matrix
-    intrinsics: list[Any]  # fx, fy, cx, cy
-    width: Any
-    height: Any
-    near: Any
-    far: Any
-    eps2d: Any
-    radius_clip: Any
 
 
 @dataclass(frozen=True)
@@ -155,26 +142,9 @@ def _compensation(spread: Spread, low_pass: Any, determinant: Any) -> Any:
 def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: Settings) -> Ellipse:
     """Project one splat a lane; works on plain and on differentiable registers."""
     v = cam.view
-    fx, fy, cx, cy = cam.intrinsics
-    px, py, pz = (
-        dr.fma(v[r], mean[0], dr.fma(v[r + 1], mean[1], dr.fma(v[r + 2], mean[2], v[r + 3]))) for r in (0, 4, 8)
-    )
-    in_range = (pz > cam.near) & (pz < cam.far)
-    inv_z = 1 / dr.select(in_range, pz, 1.0)
-    u, w = px * inv_z, py * inv_z
-
-    def clamped(slope: Any, focal: Any, centre: Any, size: Any) -> Any:
-        half = 0.5 * size / focal
-        if settings.inria:  # symmetric about the optical axis, wherever the image lies
-            limit = (1 + c.FRUSTUM_MARGIN) * half
-            return smaller(larger(slope, -limit), limit)
-        margin = c.FRUSTUM_MARGIN * half
-        return smaller(larger(slope, -centre / focal - margin), (size - centre) / focal + margin)
-
-    cu, cw = clamped(u, fx, cx, cam.width), clamped(w, fy, cy, cam.height)
-    top = [fx * inv_z * (v[k] - cu * v[8 + k]) for k in range(3)]
-    low = [fy * inv_z * (v[4 + k] - cw * v[8 + k]) for k in range(3)]
-    spread = _spread(shape, top, low)
+    point = [dr.fma(v[r], mean[0], dr.fma(v[r + 1], mean[1], dr.fma(v[r + 2], mean[2], v[r + 3]))) for r in (0, 4, 8)]
+    seen = see(point, cam, settings)
+    spread = _spread(shape, seen.top, seen.low)
     low_pass = cam.eps2d * (spread.xx + spread.yy) + cam.eps2d * cam.eps2d
     determinant = spread.sharp + low_pass
     invertible = (determinant > c.DET_MIN) & (determinant < c.DET_MAX)
@@ -182,9 +152,9 @@ def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: 
     factor = _compensation(spread, low_pass, determinant) if settings.antialiased else None
     xx, yy = spread.xx + cam.eps2d, spread.yy + cam.eps2d
     return Ellipse(
-        dr.fma(fx, u, cx),
-        dr.fma(fy, w, cy),
-        pz,
+        seen.x,
+        seen.y,
+        point[2],
         xx,
         spread.xy,
         yy,
@@ -192,21 +162,6 @@ def project(mean: list[Any], shape: Shape, opacity: Any, cam: Camera, settings: 
         *_sheared(spread, yy, determinant, cam.eps2d),
         opacity if factor is None else opacity * factor,
         factor,
-        in_range,
+        seen.in_range,
         invertible,
     )
-
-
-def exact_centre(be: Backend, mean: list[Any], cam: Camera) -> list[Any]:
-    """Projected mean relative to the middle of the image (pixels), by way of float64.
-
-    Rounding x and z to float32 before they are divided moves splats by 1e-5 pixels, which is most of an image's error.
-    """
-    J = be.plain
-    x, y, z = (J.Float64(v) for v in mean)
-    rows = [[J.Float64(v) for v in cam.view[r : r + 4]] for r in (0, 4, 8)]
-    px, py, pz = (dr.fma(v[0], x, dr.fma(v[1], y, dr.fma(v[2], z, v[3]))) for v in rows)
-    inverse = 1 / dr.select((J.Float(pz) > cam.near) & (J.Float(pz) < cam.far), pz, 1.0)
-    fx, fy, cx, cy = (J.Float64(v) for v in cam.intrinsics)
-    width, height = J.Float64(cam.width), J.Float64(cam.height)
-    return [J.Float(dr.fma(fx * px, inverse, cx - 0.5 * width)), J.Float(dr.fma(fy * py, inverse, cy - 0.5 * height))]

@@ -11,7 +11,8 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import TILE, Backend, larger, smaller
-from ._ewa import Camera, Ellipse
+from ._ewa import Ellipse
+from ._lens import Camera
 from ._settings import Settings
 
 

@@ -12,10 +12,19 @@ if TYPE_CHECKING:
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+C4 = (
+    2.5033429417967046,
+    1.7701307697799304,
+    0.9461746957575601,
+    0.6690465435572892,
+    0.10578554691520431,
+    0.47308734787878004,
+    0.6258357354491761,
+)
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Values [..., (degree + 1)^2] of the harmonics in unit ``directions`` [..., 3]; degree 0 to 3."""
+    """Values [..., (degree + 1)^2] of the harmonics in unit ``directions`` [..., 3]; degree 0 to 4."""
     import torch
 
     x, y, z = directions.unbind(-1)
@@ -41,6 +50,18 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             C3[4] * z * (xx - yy),
             -C3[0] * x * (xx - 3 * yy),
         ]
+    if degree >= 4:
+        terms += [
+            C4[0] * x * y * (xx - yy),
+            -C4[1] * y * z * (3 * xx - yy),
+            C4[2] * x * y * (7 * zz - 1),
+            -C4[3] * y * z * (7 * zz - 3),
+            C4[4] * (zz * (35 * zz - 30) + 3),
+            -C4[3] * x * z * (7 * zz - 3),
+            C4[5] * (xx - yy) * (7 * zz - 1),
+            -C4[1] * x * z * (xx - 3 * yy),
+            C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+        ]
     return torch.stack(terms, dim=-1)
 
 
@@ -48,8 +69,7 @@ def colors_seen_from(coefficients: Tensor, means: Tensor, viewmat: Tensor, degre
     """Colours [N, D] = max(0, 0.5 + SH) of coefficients [N, K, D] seen from the camera of ``viewmat`` [4, 4]."""
     import torch
 
-    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
-    centre = -torch.linalg.solve(rotation, translation)
+    centre = torch.linalg.inv(viewmat)[:3, 3]
     directions = torch.nn.functional.normalize(means - centre, dim=-1)
     count = (degree + 1) ** 2
     values = torch.einsum("nk,nkd->nd", basis(directions, degree), coefficients[:, :count])

@@ -6,12 +6,12 @@ from typing import Any
 
 import drjit as dr
 
-from ._harmonics import C1, C2, C3
+from ._harmonics import C1, C2, C3, C4
 from .constants import SH_C0
 
 
 def basis(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
-    """The (degree + 1)^2 harmonics in the unit direction x, y, z; degree 0 to 3."""
+    """The (degree + 1)^2 harmonics in the unit direction x, y, z; degree 0 to 4."""
     terms = [SH_C0 + 0 * x]
     if degree >= 1:
         terms += [-C1 * y, C1 * z, -C1 * x]
@@ -27,6 +27,18 @@ def basis(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
             -C3[2] * x * (4 * zz - xx - yy),
             C3[4] * z * (xx - yy),
             -C3[0] * x * (xx - 3 * yy),
+        ]
+    if degree >= 4:
+        terms += [
+            C4[0] * x * y * (xx - yy),
+            -C4[1] * y * z * (3 * xx - yy),
+            C4[2] * x * y * (7 * zz - 1),
+            -C4[3] * y * z * (7 * zz - 3),
+            C4[4] * (zz * (35 * zz - 30) + 3),
+            -C4[3] * x * z * (7 * zz - 3),
+            C4[5] * (xx - yy) * (7 * zz - 1),
+            -C4[1] * x * z * (xx - 3 * yy),
+            C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
     return terms
 
@@ -47,7 +59,9 @@ def colors_seen_from(coefficients: Any, means: Any, viewmat: Any, degree: int) -
     rows = [[entry(r, k) for k in range(3)] for r in range(3)]
     normals = [cross(rows[(r + 1) % 3], rows[(r + 2) % 3]) for r in range(3)]
     determinant = sum(a * b for a, b in zip(rows[0], normals[0], strict=True))
-    centre = [-sum(entry(r, 3) * normals[r][k] for r in range(3)) / determinant for k in range(3)]
+    moved = [sum(entry(r, 3) * normals[r][k] for r in range(3)) / determinant for k in range(3)]
+    scale = entry(3, 3) - sum(entry(3, k) * moved[k] for k in range(3))  # 1, with the derivative of the matrix's inverse
+    centre = [-value / scale for value in moved]
 
     i = dr.arange(index_type, n)
     away = [dr.gather(flat_type, means.array, 3 * i + k) - centre[k] for k in range(3)]

@@ -2,42 +2,67 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ._cameras import check_cameras
 from ._settings import Settings
-from .constants import MAX_CHANNELS
+
+Size = int | str
 
 
 @dataclass(frozen=True)
 class Splats:
-    """The tensor arguments of one call."""
+    """The tensor arguments of one call; `...` stands for any batch dimensions."""
 
-    means: Tensor  # [N, 3]
-    quats: Tensor | None  # [N, 4], with scales; None with covars
-    scales: Tensor | None  # [N, 3]
-    opacities: Tensor  # [N]
-    colors: Tensor  # [N, D] or [N, K, D], or one set a camera: [C, N, D] or [C, N, K, D]
-    viewmats: Tensor  # [C, 4, 4]
-    Ks: Tensor  # [C, 3, 3]
-    backgrounds: Tensor | None = None  # [C, D]
-    covars: Tensor | None = None  # [N, 3, 3]
+    means: Tensor  # [..., N, 3]
+    quats: Tensor | None  # [..., N, 4], with scales; None with covars
+    scales: Tensor | None  # [..., N, 3]
+    opacities: Tensor  # [..., N]
+    colors: Tensor | None  # [..., (C,) N, D] or harmonics [..., (C,) N, K, D] or [N, K, D]; None without colours
+    viewmats: Tensor  # [..., C, 4, 4]
+    Ks: Tensor  # [..., C, 3, 3]
+    backgrounds: Tensor | None = None  # [..., C, D]
+    covars: Tensor | None = None  # [..., N, 3, 3]
+    radial_coeffs: Tensor | None = None  # [..., C, 4]
+
+    @property
+    def batch(self) -> torch.Size:
+        """Sizes of the batch dimensions."""
+        return self.means.shape[:-2]
 
     def to(self, dtype: torch.dtype) -> Splats:
         """All tensors in `dtype`."""
         converted: dict[str, Any] = {k: None if t is None else t.to(dtype) for k, t in vars(self).items()}
         return Splats(**converted)
 
+    def batches(self, settings: Settings) -> list[Splats]:
+        """One for each element of the batch, without batch dimensions."""
+        dims = len(self.batch)
+        if dims == 0:
+            return [self]
+        count = math.prod(self.batch)
+        parts: dict[str, Any] = {}
+        for name, tensor in vars(self).items():
+            shared = name == "colors" and tensor is not None and settings.sh_degree is not None and tensor.ndim == 3
+            if tensor is None or shared:
+                parts[name] = [tensor] * count
+            else:
+                parts[name] = tensor.reshape(count, *tensor.shape[dims:]).unbind(0)
+        return [Splats(**{name: values[b] for name, values in parts.items()}) for b in range(count)]
+
     def colors_of(self, camera: int, settings: Settings) -> Tensor:
-        """Colours or harmonics that camera `camera` sees."""
+        """Colours or harmonics that camera `camera` sees, without batch dimensions."""
+        assert self.colors is not None
         shared = 2 if settings.sh_degree is None else 3
         return self.colors if self.colors.ndim == shared else self.colors[camera]
 
 
-def _expect(name: str, tensor: Tensor | None, shape: tuple[int | str, ...], sizes: dict[str, int]) -> None:
+def _expect(name: str, tensor: Tensor | None, shape: tuple[Size, ...], sizes: dict[str, int]) -> None:
     if not isinstance(tensor, Tensor):
         raise ValueError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
     wanted = "[" + ", ".join(str(s) for s in shape) + "]"
@@ -52,51 +77,58 @@ def _expect(name: str, tensor: Tensor | None, shape: tuple[int | str, ...], size
             raise ValueError(f"{name} must have the shape {wanted} ({known}), not {list(tensor.shape)}")
 
 
+def _check_colors(splats: Splats, settings: Settings, batch: tuple[Size, ...], sizes: dict[str, int]) -> None:
+    if splats.colors is None and not settings.has_colors:
+        return
+    own: tuple[Size, ...] = ("N", "D") if settings.sh_degree is None else ("N", "K", "D")
+    dims = splats.colors.ndim if isinstance(splats.colors, Tensor) else 0
+    if dims == len(batch) + len(own) + 1:
+        own = ("C", *own)
+    if settings.sh_degree is None or dims != len(own):  # harmonics may be shared by the whole batch
+        own = (*batch, *own)
+    _expect("colors", splats.colors, own, sizes)
+    if settings.sh_degree is not None and sizes["K"] < (settings.sh_degree + 1) ** 2:
+        needed = (settings.sh_degree + 1) ** 2
+        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {settings.sh_degree} needs {needed}")
+    if sizes["D"] < 1:
+        raise ValueError("colors must have at least 1 channel, not 0")
+
+
 def check_shapes(splats: Splats, settings: Settings) -> None:
     """Raise ValueError naming the first argument whose shape, type or value is not allowed."""
-    s = settings
-    s.check()
     sizes: dict[str, int] = {}
-    _expect("means", splats.means, ("N", 3), sizes)
+    batch: tuple[Size, ...] = ()
+    if isinstance(splats.means, Tensor) and splats.means.ndim > 2:
+        batch = tuple(splats.batch)
+    if math.prod(int(size) for size in batch) == 0:
+        raise ValueError(f"means must have batch dimensions of at least 1, not {list(batch)}")
+    _expect("means", splats.means, (*batch, "N", 3), sizes)
     if splats.covars is None:
-        _expect("quats", splats.quats, ("N", 4), sizes)
-        _expect("scales", splats.scales, ("N", 3), sizes)
+        _expect("quats", splats.quats, (*batch, "N", 4), sizes)
+        _expect("scales", splats.scales, (*batch, "N", 3), sizes)
     else:
-        _expect("covars", splats.covars, ("N", 3, 3), sizes)
-    _expect("opacities", splats.opacities, ("N",), sizes)
-    own: tuple[int | str, ...] = ("N", "D") if s.sh_degree is None else ("N", "K", "D")
-    if isinstance(splats.colors, Tensor) and splats.colors.ndim == len(own) + 1:
-        own = ("C", *own)
-    _expect("colors", splats.colors, own, sizes)
-    if s.sh_degree is not None and sizes["K"] < (s.sh_degree + 1) ** 2:
-        needed = (s.sh_degree + 1) ** 2
-        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {s.sh_degree} needs {needed}")
-    if not 1 <= sizes["D"] <= MAX_CHANNELS:
-        raise ValueError(f"colors must have 1 to {MAX_CHANNELS} channels, not {sizes['D']}")
-    _expect("viewmats", splats.viewmats, ("C", 4, 4), sizes)
-    _expect("Ks", splats.Ks, ("C", 3, 3), sizes)
+        _expect("covars", splats.covars, (*batch, "N", 3, 3), sizes)
+    _expect("opacities", splats.opacities, (*batch, "N"), sizes)
+    _expect("viewmats", splats.viewmats, (*batch, "C", 4, 4), sizes)
+    _check_colors(splats, settings, batch, sizes)
+    _expect("Ks", splats.Ks, (*batch, "C", 3, 3), sizes)
     if sizes["C"] < 1:
         raise ValueError("viewmats must hold at least one camera")
     if splats.backgrounds is not None:
-        _expect("backgrounds", splats.backgrounds, ("C", "D"), sizes)
+        _expect("backgrounds", splats.backgrounds, (*batch, "C", "D"), sizes)
+    if splats.radial_coeffs is not None:
+        if settings.camera_model != "fisheye":
+            raise ValueError(f"radial_coeffs is for fisheye lenses, not {settings.camera_model}; undistort the images")
+        _expect("radial_coeffs", splats.radial_coeffs, (*batch, "C", 4), sizes)
+        if splats.radial_coeffs.requires_grad:
+            raise ValueError("radial_coeffs gets no gradient; detach it")
     for name, value in vars(splats).items():
         if value is not None and value.device != splats.means.device:
             raise ValueError(f"{name} is on {value.device}, but means is on {splats.means.device}")
-    _check_cameras(splats)
-
-
-def _check_cameras(splats: Splats) -> None:
-    check_finite(viewmats=splats.viewmats, Ks=splats.Ks)
-    if splats.backgrounds is not None:
-        check_finite(backgrounds=splats.backgrounds)
-    for camera, K in enumerate(splats.Ks.tolist()):
-        if K[0][0] <= 0 or K[1][1] <= 0:
-            raise ValueError(f"Ks[{camera}] must have positive focal lengths, not {K[0][0]} and {K[1][1]}")
-        if K[0][1] != 0 or K[1][0] != 0 or K[2] != [0, 0, 1]:
-            raise ValueError(
-                f"Ks[{camera}] must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew ({K[0][1]}) is refused because other"
-                " rasterizers ignore it silently"
-            )
+    small = {"viewmats": splats.viewmats, "Ks": splats.Ks}
+    optional = {"backgrounds": splats.backgrounds, "radial_coeffs": splats.radial_coeffs}
+    check_finite(**small, **{name: tensor for name, tensor in optional.items() if tensor is not None})
+    check_cameras(*(t.detach().double().cpu().numpy() for t in (splats.viewmats, splats.Ks)))
 
 
 def check_finite(**tensors: Tensor) -> None:
@@ -110,7 +142,7 @@ def check_finite(**tensors: Tensor) -> None:
 
 
 def finish(features: Tensor, alphas: Tensor, background: Tensor | None, settings: Settings) -> Tensor:
-    """Put accumulated features [H, W, D] over the background and normalise an expected depth.
+    """Put accumulated features [..., H, W, D] over the background and normalise an expected depth.
 
     The depth channel, when there is one, is the last and has no background.
     """

@@ -10,8 +10,9 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import Backend, bits_of, larger, packet, power_of_two, write, write_packet
-from ._ewa import Camera, Shape, exact_centre, project
+from ._ewa import Shape, project
 from ._footprint import count_tiles, footprint, square_limits, square_radius
+from ._lens import Camera, exact_centre
 from ._settings import Settings
 
 RECORD = 16  # floats a splat: 8 of geometry (see Ellipse.geometry, with x and y relative to the middle of the image;
@@ -34,6 +35,7 @@ class Arrays:
     colors: Any  # [N * D]
     view: Any  # [16]
     intrinsics: Any  # [9]
+    radial: Any | None = None  # [4] of a distorted lens
 
 
 def read_camera(be: Backend, arrays: Arrays, settings: Settings) -> Camera:
@@ -47,7 +49,8 @@ def read_camera(be: Backend, arrays: Arrays, settings: Settings) -> Camera:
     limits = (s.width, s.height, s.near, s.far_plane, s.eps2d, s.radius_clip)
     opaque = [dr.opaque(J.Float, float(limit)) for limit in limits]
     intrinsics = [value(arrays.intrinsics, i) for i in (0, 4, 2, 5)]
-    return Camera([value(arrays.view, i) for i in range(12)], intrinsics, *opaque)
+    radial = [] if arrays.radial is None else [value(arrays.radial, i) for i in range(4)]
+    return Camera([value(arrays.view, i) for i in range(12)], intrinsics, radial, *opaque)
 
 
 def read_splats(be: Backend, arrays: Arrays, i: Any) -> tuple[list[Any], Shape, Any]:
@@ -117,11 +120,13 @@ def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Ca
     n, columns, options = arrays.count, arrays.columns, settings.options
     i = dr.arange(J.UInt32, n)
     mean, shape, opacity = read_splats(be, arrays, i)
-    colors = [dr.gather(J.Float, arrays.colors, columns * i + j) for j in range(columns)]
+    # Of more channels the caller has checked that they are finite, and later chunks read their own.
+    read = columns if columns <= c.MAX_CHECKED else min(columns, first_features)
+    colors = [dr.gather(J.Float, arrays.colors, columns * i + j) for j in range(read)]
     finite = _finite(be, [*mean, *shape.quat, *shape.scale, *shape.covariance, opacity, *colors])
 
     e = project(mean, shape, opacity, cam, settings)
-    centre = exact_centre(be, mean, cam)
+    centre = exact_centre(be, mean, cam, settings)
     e = replace(e, x=centre[0] + 0.5 * cam.width, y=centre[1] + 0.5 * cam.height)
     geometry = [*centre, *e.geometry()[2:]]
     log_reach = geometry[5] if options.opacity_extent else larger(geometry[5], 0.0)
@@ -148,7 +153,7 @@ def run(be: Backend, arrays: Arrays, features: int, first_features: int, cam: Ca
     counts = count_tiles(be, foot, cam.width, visible)
 
     records, footprints = dr.empty(J.Float, n * RECORD), dr.empty(J.Float, n * 8)
-    values = [*colors, e.z][:first_features] if features > columns else colors[:first_features]
+    values = ([*colors, e.z] if features > columns and read == columns else colors)[:first_features]
     values += [J.Float(0)] * (power_of_two(first_features) - first_features)
     bends = [dr.exp2(-2.0 * geometry[2]), dr.exp2(-2.0 * geometry[2] * geometry[3])]
     write_packet(be, records, [*geometry, *bends], 2 * i)

@@ -1,4 +1,4 @@
-"""Adjoint of the projection: from per-splat moments to the gradients of the inputs."""
+"""Adjoint of the projection: from the gradients of ellipses, or from per-splat moments, to those of the inputs."""
 
 from __future__ import annotations
 
@@ -10,23 +10,35 @@ import drjit as dr
 
 from . import constants as c
 from ._backend import Backend, packet, write
-from ._ewa import Camera, Shape, project
+from ._ewa import Shape, project
+from ._lens import Camera
 from ._project import RECORD, Arrays, read_splats
 from ._settings import Settings
 
 CAMERA = 16  # 12 entries of the view matrix, then fx, fy, cx, cy
+LN2 = math.log(2.0)
 
 
 @dataclass(frozen=True)
 class InputGradients:
     """Flat Dr.Jit arrays, None where nothing was asked for."""
 
-    means: Any | None  # [N * 3]
-    quats: Any | None  # [N * 4]
-    scales: Any | None  # [N * 3]
-    covars: Any | None  # [N * 9]
-    opacities: Any | None  # [N]
-    camera: Any | None  # [N * CAMERA], to be summed over the splats
+    means: Any | None = None  # [N * 3]
+    quats: Any | None = None  # [N * 4]
+    scales: Any | None = None  # [N * 3]
+    covars: Any | None = None  # [N * 9]
+    opacities: Any | None = None  # [N]
+    camera: Any | None = None  # [N * CAMERA], to be summed over the splats
+
+
+@dataclass(frozen=True)
+class OutputGradients:
+    """Gradients of what the projection makes of N splats, flat Dr.Jit arrays."""
+
+    means2d: Any | None = None  # [N * 2]
+    conics: Any | None = None  # [N * 3]
+    depths: Any | None = None  # [N]
+    absolute: Any | None = None  # [N * 2] sums over the pixels of the absolute gradients of the means
 
 
 def total_moments(be: Backend, gradients: list[Any], i: Any) -> list[Any]:
@@ -35,20 +47,68 @@ def total_moments(be: Backend, gradients: list[Any], i: Any) -> list[Any]:
     return [sum(values[1:], values[0]) for values in zip(*parts, strict=True)]
 
 
+def _mean_gradient(m: list[Any], a: Any, h: Any, d: Any) -> list[Any]:
+    return [2 * LN2 * a * m[1], 2 * LN2 * dr.fma(a * h, m[1], d * m[2])]
+
+
+def seeds_of_moments(be: Backend, records: Any, gradients: list[Any], i: Any) -> list[Any]:
+    """Gradients of `Ellipse.geometry()` from what each chunk's adjoint added up."""
+    m = total_moments(be, gradients, i)
+    _, _, a, h, d = packet(be, records, i * (RECORD // 8), 8)[:5]
+    return [*_mean_gradient(m, a, h, d), -LN2 * m[3], -2 * LN2 * a * m[4], -LN2 * m[5], LN2 * m[0]]
+
+
+def seeds_of_outputs(be: Backend, records: Any, given: OutputGradients, i: Any) -> list[Any]:
+    """Gradients of `Ellipse.geometry()` from those of the means and conics, which are a, a h and a h^2 + d, each over
+    log2(e) / 2.
+    """
+    J = be.plain
+    _, _, a, h, _ = packet(be, records, i * (RECORD // 8), 8)[:5]
+    zero = J.Float(0)
+    x, y = [zero] * 2 if given.means2d is None else [dr.gather(J.Float, given.means2d, 2 * i + k) for k in range(2)]
+    if given.conics is None:
+        return [x, y, zero, zero, zero, zero]
+    xx, xy, yy = (dr.gather(J.Float, given.conics, 3 * i + k) * (2 / c.LOG2E) for k in range(3))
+    return [x, y, dr.fma(h, dr.fma(h, yy, xy), xx), a * dr.fma(2 * h, yy, xy), yy, zero]
+
+
+def output_gradients(be: Backend, records: Any, visible: Any, gradients: list[Any], absolute: bool) -> OutputGradients:
+    """Gradients of means and conics from the moments; of the absolute ones only what is asked for."""
+    J = be.plain
+    n = dr.width(visible)
+    i = dr.arange(J.UInt32, n)
+    m = total_moments(be, gradients, i)
+    _, _, a, h, d = packet(be, records, i * (RECORD // 8), 8)[:5]
+
+    def written(values: list[Any]) -> Any:
+        target = dr.empty(J.Float, n * len(values))
+        for k, value in enumerate(values):
+            write(target, dr.select(visible, value, 0.0), len(values) * i + k)
+        return target
+
+    if absolute:
+        found = OutputGradients(absolute=written([2 * LN2 * a * m[6], 2 * LN2 * m[7]]))
+    else:
+        # In the pixel's own axes dx = s - h t.
+        conics = [-0.5 * (m[3] - h * (2 * m[4] - h * m[5])), -(m[4] - h * m[5]), -0.5 * m[5]]
+        found = OutputGradients(written(_mean_gradient(m, a, h, d)), written(conics))
+    dr.eval(found.means2d, found.conics, found.absolute)
+    return found
+
+
 def projection_adjoint(
     be: Backend,
     arrays: Arrays,
-    records: Any,
     visible: Any,
-    gradients: list[Any],
+    seeds: list[Any],
     grad_depth: Any | None,
     cam: Camera,
     settings: Settings,
     with_camera: bool,
 ) -> InputGradients:
-    """Gradients of N splats and, per splat, of the camera.
+    """Gradients of N splats and, per splat, of the camera, from those of the ellipses.
 
-    `gradients` holds what each chunk's adjoint added up, `grad_depth` is the gradient of the depth feature [N].
+    `seeds` are the gradients of `Ellipse.geometry()`, `grad_depth` that of the depth.
     """
     J, A = be.plain, be.ad
     n = arrays.count
@@ -63,25 +123,14 @@ def projection_adjoint(
         dr.enable_grad(view, intrinsics)
     dr.enable_grad(leaves)
     limits = (cam.width, cam.height, cam.near, cam.far, cam.eps2d, cam.radius_clip)
-    twin = Camera(view, intrinsics, *(A.Float(limit) for limit in limits))
+    radial = [A.Float(k) for k in cam.radial]
+    twin = Camera(view, intrinsics, radial, *(A.Float(limit) for limit in limits))
     e = project(leaves[0], Shape(leaves[1], leaves[2], leaves[3]), leaves[4][0], twin, settings)
-    outputs = e.geometry()
-
-    m = total_moments(be, gradients, i)
-    _, _, a, h, d = packet(be, records, i * (RECORD // 8), 8)[:5]
-    ln2 = math.log(2.0)
-    output_gradients = [
-        2 * ln2 * a * m[1],
-        2 * ln2 * dr.fma(a * h, m[1], d * m[2]),
-        -ln2 * m[3],
-        -2 * ln2 * a * m[4],
-        -ln2 * m[5],
-        ln2 * m[0],
-    ]
+    outputs, given = e.geometry(), list(seeds)
     if grad_depth is not None:
         outputs.append(e.z)
-        output_gradients.append(grad_depth)
-    for output, gradient in zip(outputs, output_gradients, strict=True):
+        given.append(grad_depth)
+    for output, gradient in zip(outputs, given, strict=True):
         dr.set_grad(output, gradient)
     dr.enqueue(dr.ADMode.Backward, outputs)
     dr.traverse(dr.ADMode.Backward)
@@ -104,10 +153,10 @@ def projection_adjoint(
 def opacity_adjoint(be: Backend, opacities: Any, visible: Any, gradients: list[Any], wanted: bool) -> InputGradients:
     """Gradient of the opacities alone: d log(opacity * factor) / d opacity is 1 / opacity for any constant factor."""
     if not wanted:
-        return InputGradients(None, None, None, None, None, None)
+        return InputGradients()
     i = dr.arange(be.plain.UInt32, dr.width(opacities))
     moments = total_moments(be, gradients, i)
     positive = visible & (opacities > c.OPACITY_FLOOR)
     gradient = dr.select(positive, moments[0] / dr.select(positive, opacities, 1.0), 0.0)
     dr.eval(gradient)
-    return InputGradients(None, None, None, None, gradient, None)
+    return InputGradients(opacities=gradient)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import operator
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from . import constants as c
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 SEMANTICS = ("gsplat", "inria")
+CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,7 @@ class Options:
         list_width: 4x4 tiles, side by side, that share a list: 1, 2 or 4. More make the lists sooner and blend later.
         cull_offscreen: drop splats whose footprint misses the image before they are sorted.
         count_skips: add `box_pairs` and `empty_tiles` to `meta["n_culled"]`.
+        bridge: what carries arrays between torch and Dr.Jit: "direct", or "wrap" for `drjit.wrap`.
 
     No switch changes the image beyond its rounding, except the first three.
     """
@@ -39,6 +43,7 @@ class Options:
     list_width: int = 1
     cull_offscreen: bool = True
     count_skips: bool = False
+    bridge: str = "direct"
 
     def __post_init__(self) -> None:
         """Raise ValueError naming the first value out of range."""
@@ -50,6 +55,8 @@ class Options:
             raise ValueError(f"exp_degree must be 3, 4 or 5, not {self.exp_degree!r}")
         if self.list_width not in (1, 2, 4):
             raise ValueError(f"list_width must be 1, 2 or 4, not {self.list_width!r}")
+        if self.bridge not in ("direct", "wrap"):
+            raise ValueError(f"bridge must be direct or wrap, not {self.bridge!r}")
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,25 @@ class Settings:
     rasterize_mode: str = "classic"
     semantics: str = "gsplat"
     options: Options = field(default_factory=Options)
+    camera_model: str = "pinhole"
+
+    @classmethod
+    def of(cls, width: Any, height: Any, options: Options | None = None, **arguments: Any) -> Settings:
+        """Checked settings; `arguments` are further fields by name.
+
+        Raises:
+            ValueError: a value is not allowed.
+            TypeError: a name is not that of a field.
+        """
+        unknown = set(arguments) - {f.name for f in fields(cls)}
+        if unknown:
+            raise TypeError(f"got an unexpected keyword argument {min(unknown)!r}")
+        width, height = _integer("width", width), _integer("height", height)
+        if arguments.get("sh_degree") is not None:
+            arguments["sh_degree"] = _integer("sh_degree", arguments["sh_degree"])
+        settings = cls(width, height, **arguments, options=options or Options())
+        settings.check()
+        return settings
 
     @property
     def has_colors(self) -> bool:
@@ -106,7 +132,7 @@ class Settings:
     def check(self) -> None:
         """Raise ValueError naming the first argument whose value is not allowed."""
         for name, size in (("width", self.width), ("height", self.height)):
-            if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= 65536:
+            if not 1 <= size <= 65536:
                 raise ValueError(f"{name} must be an integer from 1 to 65536, not {size!r}")
         if not 0 <= self.near_plane < self.far_plane:
             raise ValueError(f"near_plane must be >= 0 and below far_plane, not {self.near_plane} and {self.far_plane}")
@@ -117,8 +143,21 @@ class Settings:
             ("render_mode", self.render_mode, RENDER_MODES),
             ("rasterize_mode", self.rasterize_mode, RASTERIZE_MODES),
             ("semantics", self.semantics, SEMANTICS),
+            ("camera_model", self.camera_model, CAMERA_MODELS),
         ):
             if chosen not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {chosen!r}")
-        if self.sh_degree not in (None, 0, 1, 2, 3):
-            raise ValueError(f"sh_degree must be None or 0 to 3, not {self.sh_degree!r}")
+        if self.sh_degree not in (None, 0, 1, 2, 3, 4):
+            raise ValueError(f"sh_degree must be None or 0 to 4, not {self.sh_degree!r}")
+        if self.inria and self.camera_model != "pinhole":
+            raise ValueError(f'camera_model must be pinhole with semantics="inria", not {self.camera_model!r}')
+
+
+def _integer(name: str, value: Any) -> int:
+    """A Python integer of any kind of integer: numpy's, or a tensor with one element."""
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        return operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be an integer, not {value!r}") from None

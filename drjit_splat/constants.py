@@ -56,8 +56,8 @@ CUT_SLACK = 2e-3
 """log2 units added to a splat's footprint threshold, so that rounding in the conservative tile test never drops a
 pixel that the exact per-pixel test would keep."""
 
-MAX_CHANNELS = 32
-"""Most colour channels of one call."""
+MAX_CHECKED = 32
+"""Most colour channels whose finiteness the projection kernel checks in passing; more are checked before."""
 
 MAX_PAIRS = 2**31 - 1
 """Most (tile, splat) pairs of one image: indices are 32 bit."""

@@ -5,20 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from . import _core
 from ._backend import Backend, backend_named
-from ._compat import check_compatibility
+from ._cameras import check_cameras
+from ._compat import settings_of
 from ._harmonics_drjit import colors_seen_from
 from ._project import Arrays
 from ._settings import Options, Settings
-from .constants import MAX_CHANNELS
+from .constants import MAX_CHECKED
 
-_NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks")
+_NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks", "radial_coeffs")
 
 
 class _Splat(dr.CustomOp):  # type: ignore[misc]
-    """Eight tensors of one camera -> sums [H, W, F], coverage [H, W, 1]."""
+    """Nine tensors of one camera -> sums [H, W, F], coverage [H, W, 1]."""
 
     def eval(
         self,
@@ -31,9 +33,10 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
         colors: Any,
         viewmats: Any,
         Ks: Any,
+        radial_coeffs: Any,
     ) -> tuple[Any, Any]:
         """Render."""
-        given = (means, quats, scales, covars, opacities, colors, viewmats, Ks)
+        given = (means, quats, scales, covars, opacities, colors, viewmats, Ks, radial_coeffs)
         self.tensors = {k: None if t is None else dr.detach(t) for k, t in zip(_NAMES, given, strict=True)}
         self.kind = type(means)
         be = backend_named(dr.backend_v(self.kind) == dr.JitBackend.LLVM)
@@ -41,22 +44,18 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
         features = self.arrays.columns + int(settings.has_depth)
         height, width = settings.height, settings.width
         self.trace = _core.Trace(be, settings)
-        if self.arrays.count:
-            self.trace = _core.geometry(be, self.arrays, settings, features)
+        *_, coverage = _core.render(self.trace, self.arrays) if self.arrays.count else [None]
         p = self.trace.projected
         if p is not None and p.nonfinite:
             _report_first_bad(self.tensors)
-        if self.trace.lists is None:
+        if coverage is None:
             return dr.zeros(self.kind, (height, width, features)), dr.zeros(self.kind, (height, width, 1))
-        _core.shade(self.trace, self.arrays.colors, self.arrays.columns, features)
         sums = dr.empty(be.plain.Float, height * width * features)
         pixel = dr.arange(be.plain.UInt32, height * width)
         for chunk in self.trace.chunks:
             for f in range(chunk.count):
                 value = dr.gather(be.plain.Float, chunk.image.features, chunk.count * pixel + f)
                 dr.scatter(sums, value, features * pixel + chunk.first + f, mode=dr.ReduceMode.Permute)
-        first = self.trace.chunks[0].image
-        coverage = 1 - first.transmittance if first.coverage is None else first.coverage
         return (
             self.kind(_like(self.kind, sums), (height, width, features)),
             self.kind(_like(self.kind, coverage), (height, width, 1)),
@@ -79,14 +78,16 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
                 dr.scatter(part, value, chunk.count * pixel + f, mode=dr.ReduceMode.Permute)
             parts.append(part)
         dr.eval(parts)
-        g = _core.backward(trace, arrays, parts, grad_coverage, _core.Wanted(True, True, True, True))
+        g = _core.backward(
+            trace, arrays, parts, grad_coverage, _core.Wanted(shape=True, opacities=True, colors=True, camera=True)
+        )
         total = dr.sum(be.plain.TensorXf(g.inputs.camera, (arrays.count, 16)), axis=0).array
         view, K = dr.zeros(be.plain.Float, 16), dr.zeros(be.plain.Float, 9)
         twelve = dr.arange(be.plain.UInt32, 12)
         dr.scatter(view, dr.gather(be.plain.Float, total, twelve), twelve)
         dr.scatter(K, dr.gather(be.plain.Float, total, be.plain.UInt32(12, 13, 14, 15)), be.plain.UInt32(0, 4, 2, 5))
         i = g.inputs
-        found = (i.means, i.quats, i.scales, i.covars, i.opacities, g.colors, view, K)
+        found = (i.means, i.quats, i.scales, i.covars, i.opacities, g.colors, view, K, None)
         for name, gradient in zip(_NAMES, found, strict=True):
             tensor = self.tensors[name]
             if tensor is not None and gradient is not None and tensor.shape[-1]:
@@ -124,12 +125,11 @@ def _arrays(be: Backend, tensors: dict[str, Any]) -> Arrays:
         flat["colors"],
         flat["viewmats"],
         flat["Ks"],
+        flat["radial_coeffs"],
     )
 
 
 def _report_first_bad(tensors: dict[str, Any]) -> None:
-    import numpy as np
-
     for name, tensor in tensors.items():
         if tensor is None:
             continue
@@ -150,15 +150,19 @@ def _check(tensors: dict[str, Any], settings: Settings, backgrounds: Any | None)
         "colors": per_splat,
         "viewmats": ("C", 4, 4),
         "Ks": ("C", 3, 3),
+        "radial_coeffs": ("C", 4),
         "backgrounds": ("C", "D"),
     }
-    optional = {"backgrounds": backgrounds}
-    shapes_needed = ("covars",) if tensors["covars"] is not None else ("quats", "scales")
-    for name, tensor in (tensors | optional).items():
-        if tensor is None and (name == "backgrounds" or name not in shapes_needed):
+    needed = {"means", "opacities", "viewmats", "Ks"}
+    needed |= {"covars"} if tensors["covars"] is not None else {"quats", "scales"}
+    needed |= {"colors"} if settings.has_colors else set()
+    for name, tensor in (tensors | {"backgrounds": backgrounds}).items():
+        if tensor is None and name not in needed:
             continue
-        if not dr.is_tensor_v(tensor) or not dr.is_float_v(tensor):
-            raise ValueError(f"{name} must be a Dr.Jit tensor (TensorXf), not {type(tensor).__name__}")
+        if not dr.is_tensor_v(tensor) or not dr.is_float_v(tensor) or not dr.is_jit_v(tensor):
+            raise ValueError(
+                f"{name} must be a Dr.Jit tensor of a backend (drjit.llvm.ad.TensorXf), not {_kind(tensor)}"
+            )
         wanted = "[" + ", ".join(str(s) for s in shapes[name]) + "]"
         matches = len(tensor.shape) == len(shapes[name]) and all(
             got == (sizes.setdefault(want, got) if isinstance(want, str) else want)
@@ -166,11 +170,24 @@ def _check(tensors: dict[str, Any], settings: Settings, backgrounds: Any | None)
         )
         if not matches:
             raise ValueError(f"{name} must have the shape {wanted}, not {list(tensor.shape)}")
-    if not 1 <= sizes["D"] <= MAX_CHANNELS:
-        raise ValueError(f"colors must have 1 to {MAX_CHANNELS} channels, not {sizes['D']}")
-    if settings.sh_degree is not None and sizes["K"] < (settings.sh_degree + 1) ** 2:
-        needed = (settings.sh_degree + 1) ** 2
-        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {settings.sh_degree} needs {needed}")
+    if sizes["C"] < 1:
+        raise ValueError("viewmats must hold at least one camera")
+    if tensors["colors"] is not None and sizes["D"] < 1:
+        raise ValueError("colors must have at least 1 channel, not 0")
+    if settings.has_colors and settings.sh_degree is not None and sizes["K"] < (settings.sh_degree + 1) ** 2:
+        least = (settings.sh_degree + 1) ** 2
+        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {settings.sh_degree} needs {least}")
+    if tensors["radial_coeffs"] is not None and settings.camera_model != "fisheye":
+        raise ValueError(f"radial_coeffs is for fisheye lenses, not {settings.camera_model}; undistort the images")
+    small = {name: tensors[name] for name in ("viewmats", "Ks", "radial_coeffs")} | {"backgrounds": backgrounds}
+    if tensors["colors"] is not None and (settings.sh_degree is not None or sizes["D"] > MAX_CHECKED):
+        small["colors"] = tensors["colors"]  # the projection kernel checks everything that it reads itself
+    _report_first_bad({name: None if t is None else dr.detach(t) for name, t in small.items()})
+    check_cameras(dr.detach(tensors["viewmats"]).numpy(), dr.detach(tensors["Ks"]).numpy())
+
+
+def _kind(value: Any) -> str:
+    return f"{type(value).__module__}.{type(value).__name__}"
 
 
 def rasterization(
@@ -178,56 +195,50 @@ def rasterization(
     quats: Any | None,  # [N, 4]
     scales: Any | None,  # [N, 3]
     opacities: Any,  # [N]
-    colors: Any,  # [N, D] or [N, K, D]
+    colors: Any | None,  # [N, D] or [N, K, D]
     viewmats: Any,  # [C, 4, 4]
     Ks: Any,  # [C, 3, 3]
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
     *,
     backgrounds: Any | None = None,  # [C, D]
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
     covars: Any | None = None,  # [N, 3, 3]
-    semantics: str = "gsplat",
+    radial_coeffs: Any | None = None,  # [C, 4]
     options: Options | None = None,
-    **compatibility: Any,
+    **arguments: Any,
 ) -> tuple[Any, Any]:
-    """Render N Gaussians from C cameras; `dr.backward` reaches every tensor argument.
+    """Render as `drjit_splat.rasterization` does; all arrays are float32 tensors of one Dr.Jit backend.
 
-    Arguments are those of `drjit_splat.rasterization` as `TensorXf` of `drjit.llvm.ad` or `drjit.cuda.ad` (or of a
-    Mitsuba variant on them), one backend for all. Call it outside symbolic loops and calls.
+    Args:
+        means: [N, 3]; this and the others as in `drjit_splat.rasterization`, without batch dimensions.
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        colors: [N, D], or harmonics [N, K, D] when `sh_degree` is given; None without colours.
+        viewmats: [C, 4, 4].
+        Ks: [C, 3, 3].
+        width: pixels.
+        height: pixels.
+        backgrounds: [C, D].
+        covars: [N, 3, 3].
+        radial_coeffs: [C, 4], without gradients.
+        options: accuracy and skips.
+        arguments: `near_plane`, `far_plane`, `radius_clip`, `eps2d`, `sh_degree`, `render_mode`, `rasterize_mode`,
+            `camera_model` and `semantics` of `drjit_splat.rasterization`; those of gsplat that change nothing.
 
     Returns:
-        colors [C, H, W, D (+ 1 with a depth)] and alphas [C, H, W, 1], tensors of the type of `means`.
+        colors [C, H, W, D (+ 1 with a depth)] and alphas [C, H, W, 1], differentiable in reverse mode.
 
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
+        TypeError: there is no such argument.
         MemoryError: the splats cover more tiles than can be stored.
         RuntimeError: no LLVM library was found; the message says what to install.
     """
-    check_compatibility(compatibility)
-    settings = Settings(
-        width,
-        height,
-        near_plane,
-        far_plane,
-        radius_clip,
-        eps2d,
-        sh_degree,
-        render_mode,
-        rasterize_mode,
-        semantics,
-        options or Options(),
-    )
-    settings.check()
+    settings = settings_of(width, height, options, arguments)
     if covars is not None:
         quats = scales = None
-    values = (means, quats, scales, covars, opacities, colors, viewmats, Ks)
+    values = (means, quats, scales, covars, opacities, colors, viewmats, Ks, radial_coeffs)
     tensors = dict(zip(_NAMES, values, strict=True))
     _check(tensors, settings, backgrounds)
     kind = type(means)
@@ -236,9 +247,10 @@ def rasterization(
         seen = colors
         if not settings.has_colors:
             seen = kind(dr.array_t(kind)(), (means.shape[0], 0))
-        elif sh_degree is not None:
-            seen = colors_seen_from(colors, means, viewmats[i], sh_degree)
-        one = tensors | {"colors": seen, "viewmats": viewmats[i], "Ks": Ks[i]}
+        elif settings.sh_degree is not None:
+            seen = colors_seen_from(colors, means, viewmats[i], settings.sh_degree)
+        radial = None if radial_coeffs is None else dr.detach(radial_coeffs[i])
+        one = tensors | {"colors": seen, "viewmats": viewmats[i], "Ks": Ks[i], "radial_coeffs": radial}
         try:
             sums, coverage = dr.custom(_Splat, settings, **one)
         except RuntimeError as error:  # Dr.Jit wraps whatever goes wrong inside a custom operation

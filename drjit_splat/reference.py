@@ -6,6 +6,7 @@ of the kernels is shared except `constants.py`, the argument checks and the sphe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,10 @@ import torch
 from torch import Tensor
 
 from . import constants as c
+from ._compat import settings_of
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
+from ._reference_lens import see, within_lens
 from ._rotations import quats_to_rotations
 from ._settings import Options, Settings
 
@@ -52,32 +55,15 @@ def _root(splats: Splats) -> Tensor:
     return quats_to_rotations(splats.quats) * splats.scales[:, None, :]
 
 
-def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings) -> Projection:
+def project(splats: Splats, viewmat: Tensor, K: Tensor, settings: Settings, radial: Tensor | None = None) -> Projection:
     """EWA projection of all splats by one camera."""
     s = settings
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = splats.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = points[:, 2]
-    in_range = (depths > s.near) & (depths < s.far_plane)
-    z = torch.where(in_range, depths, torch.ones_like(depths))
-    slope = points[:, :2] / z[:, None]
-    means2d = torch.stack([fx * slope[:, 0] + cx, fy * slope[:, 1] + cy], -1)
-
-    clamped = []
-    for i, (focal, centre, size) in enumerate(((fx, cx, s.width), (fy, cy, s.height))):
-        margin = c.FRUSTUM_MARGIN * 0.5 * size / focal
-        low, high = -centre / focal - margin, (size - centre) / focal + margin
-        if s.inria:  # symmetric about the optical axis, wherever the image lies
-            high = (1 + c.FRUSTUM_MARGIN) * 0.5 * size / focal
-            low = -high
-        clamped.append(torch.minimum(torch.maximum(slope[:, i], low), high))
-    rows = torch.stack(
-        [
-            (fx / z)[:, None] * (viewmat[0, :3] - clamped[0][:, None] * viewmat[2, :3]),
-            (fy / z)[:, None] * (viewmat[1, :3] - clamped[1][:, None] * viewmat[2, :3]),
-        ],
-        dim=1,
-    )
+    in_range = (depths > s.near) & (depths < s.far_plane) & within_lens(points, s, radial)
+    points = torch.where(in_range[:, None], points, torch.ones_like(points))
+    means2d, jacobian = see(points, K, s, radial)
+    rows = jacobian @ viewmat[:3, :3]
     half = rows @ _root(splats)
     xx, xy, yy = (half[:, 0] ** 2).sum(-1), (half[:, 0] * half[:, 1]).sum(-1), (half[:, 1] ** 2).sum(-1)
     # The determinant of half @ half^T as a sum of squared minors: xx * yy - xy^2 cancels for needles.
@@ -200,36 +186,30 @@ def blend(
 
 
 def rasterization(
-    means: Tensor,  # [N, 3]
-    quats: Tensor | None,  # [N, 4]
-    scales: Tensor | None,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, D] or [N, K, D]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
+    means: Tensor,  # [..., N, 3]
+    quats: Tensor | None,  # [..., N, 4]
+    scales: Tensor | None,  # [..., N, 3]
+    opacities: Tensor,  # [..., N]
+    colors: Tensor | None,  # [..., (C,) N, D] or [..., (C,) N, K, D]
+    viewmats: Tensor,  # [..., C, 4, 4]
+    Ks: Tensor,  # [..., C, 3, 3]
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
     *,
-    backgrounds: Tensor | None = None,  # [C, D]
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
-    covars: Tensor | None = None,  # [N, 3, 3]
-    semantics: str = "gsplat",
+    backgrounds: Tensor | None = None,  # [..., C, D]
+    covars: Tensor | None = None,  # [..., N, 3, 3]
+    radial_coeffs: Tensor | None = None,  # [..., C, 4]
     options: Options | None = None,
     order: Tensor | None = None,
     decisions: list[Decisions] | None = None,
+    **arguments: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render as `drjit_splat.rasterization` does, in float64.
 
     The arguments that are not listed are those of `drjit_splat.rasterization`.
 
     Args:
-        order: [C, N] splat ids near to far; by default the float64 depths decide.
+        order: [..., C, N] splat ids near to far; by default the float64 depths decide.
         decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
 
     Returns:
@@ -241,35 +221,45 @@ def rasterization(
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
     """
-    settings = Settings(
-        width,
-        height,
-        near_plane,
-        far_plane,
-        radius_clip,
-        eps2d,
-        sh_degree,
-        render_mode,
-        rasterize_mode,
-        semantics,
-        options or Options(),
-    )
+    settings = settings_of(width, height, options, arguments)
     if covars is not None:
         quats = scales = None
-    given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+    given = Splats(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, radial_coeffs)
     check_shapes(given, settings)
     check_finite(**{name: tensor for name, tensor in vars(given).items() if tensor is not None})
-    splats = given.to(torch.float64)
+    double = given.to(torch.float64)
+    batches = double.batches(settings)
+    orders = [None] * len(batches) if order is None else order.reshape(len(batches), -1, means.shape[-2])
+    first = (
+        [None] * len(batches)
+        if decisions is None
+        else [
+            decisions[b * len(decisions) // len(batches) :][: len(decisions) // len(batches)]
+            for b in range(len(batches))
+        ]
+    )
+    found = [_images(s, settings, o, d) for s, o, d in zip(batches, orders, first, strict=True)]
+    if not given.batch:
+        return found[0]
+    colors_, alphas, metas = zip(*found, strict=True)
+    return _stacked(colors_, given), _stacked(alphas, given), _batched(metas, given)
 
+
+def _images(
+    splats: Splats, settings: Settings, order: Tensor | None, decisions: list[Decisions] | None
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Images of all cameras, without batch dimensions."""
     images, coverages, metas = [], [], []
-    for i in range(len(viewmats)):
+    for i in range(len(splats.viewmats)):
         viewmat, K = splats.viewmats[i], splats.Ks[i]
-        projection = project(splats, viewmat, K, settings)
+        radial = None if splats.radial_coeffs is None else splats.radial_coeffs[i]
+        projection = project(splats, viewmat, K, settings, radial)
         parts = []
-        if settings.has_colors and sh_degree is None:
+        if settings.has_colors and settings.sh_degree is None:
             parts.append(splats.colors_of(i, settings))
         elif settings.has_colors:
-            parts.append(colors_seen_from(splats.colors_of(i, settings), splats.means, viewmat, int(sh_degree or 0)))
+            harmonics = splats.colors_of(i, settings)
+            parts.append(colors_seen_from(harmonics, splats.means, viewmat, int(settings.sh_degree or 0)))
         if settings.has_depth:
             parts.append(projection.depths[:, None])
         sums, coverage, taken, margin = blend(
@@ -293,3 +283,17 @@ def rasterization(
         "margin": torch.stack([margin for _, _, margin in metas]),
     }
     return torch.stack(images), torch.stack(coverages), meta
+
+
+def _stacked(parts: Sequence[Tensor], given: Splats) -> Tensor:
+    return torch.stack(list(parts)).view(*given.batch, *parts[0].shape)
+
+
+def _batched(metas: Sequence[dict[str, Any]], given: Splats) -> dict[str, Any]:
+    """Meta of all elements of the batch; `decisions` is a flat list of their cameras'."""
+    return {
+        name: [d for meta in metas for d in meta[name]]
+        if name == "decisions"
+        else _stacked([meta[name] for meta in metas], given)
+        for name in metas[0]
+    }

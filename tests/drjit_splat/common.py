@@ -60,7 +60,7 @@ def compare(scene: dict[str, Tensor], width: int, height: int, margin: float = 1
     """
     single = {k: v.clone().requires_grad_() for k, v in scene.items()}
     double = {k: v.double().requires_grad_() for k, v in scene.items()}
-    image, alpha, meta = rasterization(**single, width=width, height=height, **options)
+    image, alpha, meta = rasterization(**single, width=width, height=height, packed=False, **options)
     order = torch.argsort(meta["depths"], dim=-1, stable=True)
     wanted, wanted_alpha, expected = reference.rasterization(
         **double, width=width, height=height, order=order, **options
@@ -114,6 +114,6 @@ def one_splat(**changes: Any) -> dict[str, Tensor]:
 def render_with_gradients(scene: dict[str, Tensor], width: int, height: int, **options: Any) -> tuple[Tensor, Any, Any]:
     """Image, gradients of the sum of image and coverage by argument, and meta."""
     leaves = {k: v.clone().requires_grad_() for k, v in scene.items()}
-    image, alpha, meta = rasterization(**leaves, width=width, height=height, **options)
+    image, alpha, meta = rasterization(**leaves, width=width, height=height, packed=False, **options)
     (image.sum() + alpha.sum()).backward()
     return image.detach(), {k: v.grad for k, v in leaves.items()}, meta

@@ -36,7 +36,7 @@ def test_skipped_work_stays_within_the_bound(seed: int, opacity: float) -> None:
     scene["opacities"] *= opacity
     scene.pop("backgrounds")
     options = Options()
-    image, _, meta = rasterization(**scene, width=SIZE, height=SIZE, options=options)
+    image, _, meta = rasterization(**scene, width=SIZE, height=SIZE, packed=False, options=options)
     exact, alphas = everything(meta, scene["colors"])
     faint = ((alphas < options.alpha_min) & (alphas > 0)).sum(-1)
     bound = 1 - (1 - options.alpha_min) ** faint.double() + options.transmittance_min / (1 - constants.ALPHA_MAX)
@@ -49,5 +49,5 @@ def test_smaller_thresholds_buy_the_error_back() -> None:
     scene = random_scene(count=400, seed=1)
     scene.pop("backgrounds")
     careful = Options(alpha_min=1e-6, transmittance_min=1e-9)
-    image, _, meta = rasterization(**scene, width=SIZE, height=SIZE, options=careful)
+    image, _, meta = rasterization(**scene, width=SIZE, height=SIZE, packed=False, options=careful)
     assert float((image[0] - everything(meta, scene["colors"])[0]).abs().max()) < 2e-3

@@ -29,6 +29,7 @@ def test_recorded_images(camera: str) -> None:
         semantics="inria",
         backgrounds=data["in/bg"][None],
         render_mode="RGB+D",
+        packed=False,
     )
     wanted = torch.cat([data[f"out/{camera}_{kind}"] for kind in ("rgb", "depth", "alpha")])
     error = (torch.cat([color[0], alpha[0]], -1).permute(2, 0, 1) - wanted).abs()

@@ -127,7 +127,7 @@ def test_every_camera_may_have_its_own_colors() -> None:
 
 def test_conics_are_the_inverse_covariances() -> None:
     scene = random_scene(count=100)
-    meta = rasterization(**scene, width=64, height=64)[2]
+    meta = rasterization(**scene, width=64, height=64, packed=False)[2]
     settings = Settings(64, 64)
     splats = reference.Splats(**{k: v.double() for k, v in scene.items()})
     p = reference.project(splats, splats.viewmats[0], splats.Ks[0], settings)
@@ -151,6 +151,6 @@ def test_shared_lists_are_shorter_and_change_no_pixel(options: Options, semantic
     alone = (
         meta
         if options.exact_tiles
-        else rasterization(**scene, width=61, height=47, options=Options(exact_tiles=False))[2]
+        else rasterization(**scene, width=61, height=47, packed=False, options=Options(exact_tiles=False))[2]
     )
     assert shared_meta["n_pairs"][0] < 0.8 * alone["n_pairs"][0]

@@ -51,7 +51,7 @@ def skipped_work(case: Case) -> Row:
 
     `skip_error` is in units of the colours' range, `skip_ratio` the largest share of its bound that a pixel uses.
     """
-    image, _, meta = rasterization(**_arguments(case))
+    image, _, meta = rasterization(**_arguments(case), packed=False)
     worst = {"skip_error": 0.0, "skip_ratio": 0.0}
     options = Options()
     for camera in range(len(image)):
@@ -134,7 +134,7 @@ def conditioned_errors(case: Case, floor: float) -> Row:
     gradients, `floor` times their norm is granted besides.
     """
     leaves = {k: v.clone().requires_grad_() for k, v in case.scene.items()}
-    image, alpha, meta = rasterization(**leaves, **case.options, width=case.width, height=case.height)
+    image, alpha, meta = rasterization(**leaves, **case.options, width=case.width, height=case.height, packed=False)
     order = torch.argsort(meta["depths"], dim=-1, stable=True)
     _, _, _, expected = _oracle(case, case.scene, None, order=order)
     trusted = (expected["margin"] > MARGIN)[..., None]
