@@ -60,7 +60,9 @@ def colors_seen_from(coefficients: Any, means: Any, viewmat: Any, degree: int) -
     normals = [cross(rows[(r + 1) % 3], rows[(r + 2) % 3]) for r in range(3)]
     determinant = sum(a * b for a, b in zip(rows[0], normals[0], strict=True))
     moved = [sum(entry(r, 3) * normals[r][k] for r in range(3)) / determinant for k in range(3)]
-    scale = entry(3, 3) - sum(entry(3, k) * moved[k] for k in range(3))  # 1, with the derivative of the matrix's inverse
+    scale = entry(3, 3) - sum(
+        entry(3, k) * moved[k] for k in range(3)
+    )  # 1, with the derivative of the matrix's inverse
     centre = [-value / scale for value in moved]
 
     i = dr.arange(index_type, n)

@@ -1,4 +1,4 @@
-"""Rotation matrices of the oracle's quaternions."""
+"""Rotation matrices of quaternions, in torch."""
 
 from __future__ import annotations
 

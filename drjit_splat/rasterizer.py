@@ -110,9 +110,9 @@ def rasterization(
     Returns:
         colors [..., C, H, W, D (+ 1 with a depth)], alphas [..., C, H, W, 1] in the dtype of `means`, and meta.
 
-        Meta is a dict whose values are made when somebody looks: `means2d` [..., C, N, 2] pixels, `conics` [..., C, N, 3]
-        (xx, xy, yy of the inverse covariance) and `depths` [..., C, N], which stand in the graph between splats and
-        images; `radii` [..., C, N, 2] pixels (0 where culled) and `opacities` [..., C, N], detached. If `packed`, all
+        Meta is a dict whose values are made when somebody looks: `means2d` [..., C, N, 2] pixels, `conics`
+        [..., C, N, 3] (xx, xy, yy of the inverse covariance) and `depths` [..., C, N], which stand in the graph between
+        splats and images; `radii` [..., C, N, 2] pixels (0 where culled) and `opacities` [..., C, N], detached. If `packed`, all
         these have one row a visible splat, [nnz, ...], whose `batch_ids`, `camera_ids` and `gaussian_ids` are given.
         Further gsplat's `tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`, `tile_*`, `n_batches`,
         `n_cameras`, `width` and `height`; and, of this rasterizer alone, `visible` [..., C, N] and lists with one entry

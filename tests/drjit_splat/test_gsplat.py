@@ -75,6 +75,9 @@ def test_images_from_gsplats_projection_and_harmonics() -> None:
         {"packed": True, "tile_size": 16, "channel_chunk": 32, "segmented": False},
         {"sparse_grad": False, "absgrad": False, "distributed": False, "camera_model": "pinhole"},
         {"with_ut": False, "with_eval3d": False, "radial_coeffs": None, "viewmats_rs": None},
+        {"return_normals": False, "global_z_order": True, "rays": None, "lidar_coeffs": None, "ut_params": None},
+        {"external_distortion_coeffs": None, "extra_signals": None, "extra_signals_sh_degree": None},
+        {"renderer_config": None, "tile_size": None, "absgrad": True, "sparse_grad": True},
     ],
 )
 def test_arguments_that_change_no_pixel_are_accepted(arguments: dict[str, object]) -> None:
@@ -86,12 +89,14 @@ def test_arguments_that_change_no_pixel_are_accepted(arguments: dict[str, object
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("absgrad", True),
-        ("sparse_grad", True),
-        ("camera_model", "fisheye"),
+        ("distributed", True),
         ("with_ut", True),
-        ("radial_coeffs", torch.zeros(1, 6)),
+        ("with_eval3d", True),
+        ("tangential_coeffs", torch.zeros(1, 2)),
         ("rolling_shutter", "ROLLING_TOP_TO_BOTTOM"),
+        ("lidar_coeffs", object()),
+        ("rays", torch.zeros(1, 16, 16, 6)),
+        ("return_normals", True),
     ],
 )
 def test_arguments_that_ask_for_more_are_refused(name: str, value: object) -> None:

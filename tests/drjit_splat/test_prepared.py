@@ -24,7 +24,7 @@ def test_shading_equals_rendering(mode: str) -> None:
     colors = scene["colors"].flip(0).requires_grad_()
     image, alpha, meta = prepared.shade(colors, backgrounds=scene["backgrounds"])
     arguments = scene | {"colors": colors.detach().clone().requires_grad_()}
-    expected = rasterization(**arguments, width=64, height=48, rasterize_mode=mode, render_mode="RGB+ED")
+    expected = rasterization(**arguments, width=64, height=48, packed=False, rasterize_mode=mode, render_mode="RGB+ED")
     assert float((image - expected[0]).detach().abs().max()) < 1e-5
     assert torch.equal(meta["radii"], expected[2]["radii"])
     weight = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))

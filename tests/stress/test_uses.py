@@ -82,7 +82,8 @@ def test_27_popping_along_an_orbit_is_no_more_than_a_splat(worst: Worst) -> None
         turn = torch.eye(4)
         turn[0, 0] = turn[2, 2] = math.cos(angle)
         turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
-        image, _, meta = rasterization(**(scene | {"viewmats": scene["viewmats"] @ turn}), width=32, height=32, packed=False)
+        turned = scene | {"viewmats": scene["viewmats"] @ turn}
+        image, _, meta = rasterization(**turned, width=32, height=32, packed=False)
         order = meta["depths"][0].argsort()
         if last is not None:
             change = float((image - last[0]).abs().max())
