@@ -7,8 +7,6 @@ written out, so that the graph is as gsplat's and costs nothing.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -16,11 +14,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
-from ._backend import Backend, backend_of, exclusive
+from ._backend import exclusive
 from ._bridge import cross
+from ._call import INPUTS, Call, Pending
 from ._gradients import (
-    INPUTS,
-    PER_SPLAT,
     arrays_of,
     blend_gradients,
     given_gradients,
@@ -29,54 +26,7 @@ from ._gradients import (
     summed,
 )
 from ._inputs import check_finite
-from ._settings import Settings
 from ._values import empty_outputs
-
-
-@dataclass
-class Pending:
-    """What the second node's adjoint leaves for the first one's."""
-
-    task: int  # of the backward pass that left it
-    given: tuple[Tensor, ...]  # gradients that it passed on, of the means, conics and depths
-    inputs: list[Tensor | None]  # gradients of the first node's inputs, as far as they come by way of the images
-
-
-@dataclass
-class Call:
-    """What the two nodes of one call share. It must not keep their results, which would keep the graph alive."""
-
-    be: Backend
-    settings: Settings
-    batch: tuple[int, ...]  # sizes of the batch dimensions
-    cameras: int  # of each element of the batch
-    packed: bool = False
-    sparse: bool = False
-    absgrad: bool = False
-    wrapped: bool = False  # whether `dr.wrap` is the bridge
-    traces: list[_core.Trace] = field(default_factory=list)  # one an image
-    asked: tuple[bool, ...] = ()  # which inputs of the first node want gradients
-    looked: set[str] = field(default_factory=set)  # names of the results in between that somebody has seen
-    images: tuple[Tensor, Tensor] | None = None  # sums and coverage, on their way to the second node
-    pending: Pending | None = None
-
-    @property
-    def batches(self) -> int:
-        """Number of elements of the batch."""
-        return math.prod(self.batch)
-
-    @property
-    def count(self) -> int:
-        """Number of images."""
-        return self.batches * self.cameras
-
-    def of_image(self, tensors: tuple[Tensor | None, ...], i: int) -> list[Tensor | None]:
-        """Those of the first node's inputs that make image `i`."""
-        first = PER_SPLAT * (i // self.cameras)
-        views, Ks, radial = tensors[PER_SPLAT * self.batches :]
-        assert views is not None and Ks is not None
-        cameras = (views[i], Ks[i], None if radial is None else radial[i])
-        return [*tensors[first : first + PER_SPLAT], *cameras]
 
 
 def _contiguous(tensors: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
@@ -223,13 +173,3 @@ def rasterize(call: Call, inputs: tuple[Tensor | None, ...], colors: list[Tensor
     between = Project.apply(call, [c.detach().contiguous() for c in colors], *inputs)
     sums, coverage = Composite.apply(call, inputs, *between, *colors)
     return sums, coverage, *between
-
-
-def call_for(device: torch.device, settings: Settings, batch: tuple[int, ...], cameras: int, **switches: Any) -> Call:
-    """A call whose tensors are on `device`.
-
-    Raises:
-        RuntimeError: no LLVM >= 16 (CPU) or no CUDA driver could be loaded.
-        ValueError: the device is neither a CPU nor a CUDA device.
-    """
-    return Call(backend_of(device), settings, batch, cameras, **switches)

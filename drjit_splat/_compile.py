@@ -5,11 +5,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import wraps
+from types import CodeType
 from typing import Any, TypeVar, cast
 
 import torch
+from torch._C._dynamo import eval_frame
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _skip(code: CodeType) -> None:
+    """Keep the compiler from beginning with a function that it meets after it has left its caller's graph."""
+    if hasattr(eval_frame, "skip_code"):  # torch < 2.6
+        eval_frame.skip_code(code)
+    elif hasattr(eval_frame, "set_code_exec_strategy"):
+        skip, default = eval_frame._FrameAction.SKIP, eval_frame._FrameAction.DEFAULT
+        eval_frame.set_code_exec_strategy(code, eval_frame._FrameExecStrategy(skip, default))
 
 
 def outside_graphs(function: F) -> F:
@@ -28,4 +39,5 @@ def outside_graphs(function: F) -> F:
         return disabled[0](*arguments, **named)
 
     call._torchdynamo_disable = True  # type: ignore[attr-defined]
+    _skip(cast(Any, call).__code__)
     return cast(F, call)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,15 +11,10 @@ from torch import Tensor
 from . import _core
 from ._backend import Backend
 from ._bridge import cross
+from ._call import PER_SPLAT, Call
 from ._project import Arrays
 from ._project_backward import InputGradients, OutputGradients
 from ._values import BETWEEN, packed, unpacked, visible_rows
-
-if TYPE_CHECKING:
-    from ._autograd import Call
-
-INPUTS = ("means", "quats", "scales", "covars", "opacities", "viewmats", "Ks", "radial_coeffs", "colors")
-PER_SPLAT = 5  # of these the first five, once an element of the batch
 
 
 def arrays_of(count: int, columns: int, arrays: tuple[Any, ...]) -> Arrays:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from . import _values
-from ._autograd import Call
 from ._backend import exclusive
+from ._call import Call
 from ._core import Trace
 from ._intersections import intersections
 from ._project import CULLED

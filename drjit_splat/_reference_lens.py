@@ -9,9 +9,9 @@ from . import constants as c
 from ._settings import Settings
 
 
-def _fisheye(point: Tensor, K: Tensor, radial: Tensor | None) -> Tensor:
-    """Pixel [2] of a point [3] in front of an equidistant lens with OpenCV's polynomial."""
-    x, y, z = point.unbind(-1)
+def _fisheye(points: Tensor, K: Tensor, radial: Tensor | None) -> Tensor:
+    """Pixels [N, 2] of points [N, 3] in front of an equidistant lens with OpenCV's polynomial."""
+    x, y, z = points.unbind(-1)
     squared = (x * x + y * y) / (z * z)
     axial = squared < 1e-8
     tangent = torch.where(axial, torch.ones_like(squared), squared).sqrt()
@@ -22,8 +22,8 @@ def _fisheye(point: Tensor, K: Tensor, radial: Tensor | None) -> Tensor:
     return torch.stack([K[0, 0] * x / z * ratio + K[0, 2], K[1, 1] * y / z * ratio + K[1, 2]], -1)
 
 
-def _ortho(point: Tensor, K: Tensor, radial: Tensor | None) -> Tensor:
-    return torch.stack([K[0, 0] * point[0] + K[0, 2], K[1, 1] * point[1] + K[1, 2]], -1)
+def _ortho(points: Tensor, K: Tensor, radial: Tensor | None) -> Tensor:
+    return torch.stack([K[0, 0] * points[:, 0] + K[0, 2], K[1, 1] * points[:, 1] + K[1, 2]], -1)
 
 
 def _pinhole(points: Tensor, K: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
@@ -60,10 +60,8 @@ def see(points: Tensor, K: Tensor, settings: Settings, radial: Tensor | None) ->
     if settings.camera_model == "pinhole":
         return _pinhole(points, K, settings)
     mapping = _fisheye if settings.camera_model == "fisheye" else _ortho
-
-    def pixel(point: Tensor) -> Tensor:
-        return mapping(point, K, radial)
-
-    found: Tensor = torch.func.vmap(pixel)(points)
-    jacobian: Tensor = torch.func.vmap(torch.func.jacfwd(pixel))(points)
-    return found, jacobian
+    with torch.enable_grad():
+        start = points if points.requires_grad else points.detach().requires_grad_()
+        pixels = mapping(start, K, radial)
+        rows = [torch.autograd.grad(pixels[:, i].sum(), start, create_graph=True)[0] for i in range(2)]
+    return pixels, torch.stack(rows, 1)

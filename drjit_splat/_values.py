@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from ._call import Call
+from ._core import Trace
 from ._project import RECORD
 from .constants import LOG2E
-
-if TYPE_CHECKING:
-    from ._autograd import Call
-    from ._core import Trace
 
 BETWEEN = {"means2d": 2, "conics": 3, "depths": 1}
 """What stands between splats and images in torch's graph, and the numbers of each splat."""

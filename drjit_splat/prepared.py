@@ -10,10 +10,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _core
-from ._autograd import Call, stack
+from ._autograd import stack
 from ._backend import backend_of, exclusive, flat
+from ._call import INPUTS, Call
 from ._compile import outside_graphs
-from ._gradients import INPUTS, arrays_of
+from ._gradients import arrays_of
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
 from ._meta import Meta, describe

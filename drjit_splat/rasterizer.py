@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._autograd import call_for, rasterize
+from ._autograd import rasterize
 from ._backend import exclusive
+from ._call import call_for
 from ._compat import check_compatibility
 from ._compile import outside_graphs
 from ._harmonics import colors_seen_from
@@ -112,12 +113,12 @@ def rasterization(
 
         Meta is a dict whose values are made when somebody looks: `means2d` [..., C, N, 2] pixels, `conics`
         [..., C, N, 3] (xx, xy, yy of the inverse covariance) and `depths` [..., C, N], which stand in the graph between
-        splats and images; `radii` [..., C, N, 2] pixels (0 where culled) and `opacities` [..., C, N], detached. If `packed`, all
-        these have one row a visible splat, [nnz, ...], whose `batch_ids`, `camera_ids` and `gaussian_ids` are given.
-        Further gsplat's `tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`, `tile_*`, `n_batches`,
-        `n_cameras`, `width` and `height`; and, of this rasterizer alone, `visible` [..., C, N] and lists with one entry
-        an image for `n_visible`, `n_pairs` ((tile, splat) pairs) and `n_culled` (splats by reason, and `occluded_pairs`
-        that the early stop never touched).
+        splats and images; `radii` [..., C, N, 2] pixels (0 where culled) and `opacities` [..., C, N], detached. If
+        `packed`, all these have one row a visible splat, [nnz, ...], whose `batch_ids`, `camera_ids` and `gaussian_ids`
+        are given. Further gsplat's `tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`, `tile_*`,
+        `n_batches`, `n_cameras`, `width` and `height`; and, of this rasterizer alone, `visible` [..., C, N] and lists
+        with one entry an image for `n_visible`, `n_pairs` ((tile, splat) pairs) and `n_culled` (splats by reason, and
+        `occluded_pairs` that the early stop never touched).
 
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity, or asks for something
