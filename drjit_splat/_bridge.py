@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -34,9 +33,10 @@ def cross(be: Backend, kernels: Kernels, tensors: list[Tensor | None], wrapped: 
     return list(found)
 
 
-@lru_cache(maxsize=8)
-def _wrap() -> Callable[..., Any]:
-    return dr.wrap(source="torch", target="drjit")
+def torch_to_drjit() -> Callable[..., Any]:
+    """The decorator `drjit.wrap` for functions that torch calls."""
+    decorator: Callable[..., Any] = dr.wrap(source="torch", target="drjit")
+    return decorator
 
 
 def _through_wrap(kernels: Kernels) -> Callable[..., Any]:
@@ -44,4 +44,4 @@ def _through_wrap(kernels: Kernels) -> Callable[..., Any]:
         arrays = (None if t is None else be.plain.Float(dr.detach(t.array, False)) for t in tensors)
         return kernels(be, *arrays)
 
-    return _wrap()(run)
+    return torch_to_drjit()(run)  # type: ignore[no-any-return]

@@ -29,7 +29,7 @@ class Options:
         list_width: 4x4 tiles, side by side, that share a list: 1, 2 or 4. More make the lists sooner and blend later.
         cull_offscreen: drop splats whose footprint misses the image before they are sorted.
         count_skips: add `box_pairs` and `empty_tiles` to `meta["n_culled"]`.
-        bridge: what carries arrays between torch and Dr.Jit: "direct", or "wrap" for `drjit.wrap`.
+        bridge: what carries arrays between torch and Dr.Jit: "wrap" for `drjit.wrap`, or "direct" without it.
 
     No switch changes the image beyond its rounding, except the first three.
     """
@@ -43,7 +43,7 @@ class Options:
     list_width: int = 1
     cull_offscreen: bool = True
     count_skips: bool = False
-    bridge: str = "direct"
+    bridge: str = "wrap"
 
     def __post_init__(self) -> None:
         """Raise ValueError naming the first value out of range."""
@@ -55,8 +55,8 @@ class Options:
             raise ValueError(f"exp_degree must be 3, 4 or 5, not {self.exp_degree!r}")
         if self.list_width not in (1, 2, 4):
             raise ValueError(f"list_width must be 1, 2 or 4, not {self.list_width!r}")
-        if self.bridge not in ("direct", "wrap"):
-            raise ValueError(f"bridge must be direct or wrap, not {self.bridge!r}")
+        if self.bridge not in ("wrap", "direct"):
+            raise ValueError(f"bridge must be wrap or direct, not {self.bridge!r}")
 
 
 @dataclass(frozen=True)

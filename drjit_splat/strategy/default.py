@@ -133,7 +133,7 @@ class DefaultStrategy(Strategy):
         state["count"].index_add_(0, index, torch.ones_like(index, dtype=torch.float32))
         if "radii" in state:
             share = radii.amax(-1) / float(max(info["width"], info["height"]))
-            state["radii"].index_reduce_(0, index, share, "amax")
+            state["radii"].scatter_reduce_(0, index, share, "amax")
 
     def _grow(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
         """Duplicate and split; returns how many."""
