@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -165,6 +166,22 @@ def exclusive(function: F) -> F:
             return function(*arguments, **named)
 
     return cast(F, waiting)
+
+
+def undisturbed(function: F) -> F:
+    """`function` without collection of garbage: an array of torch's that goes while Dr.Jit records ends the process."""
+
+    @wraps(function)
+    def quiet(*arguments: Any, **named: Any) -> Any:
+        if not gc.isenabled():
+            return function(*arguments, **named)
+        gc.disable()
+        try:
+            return function(*arguments, **named)
+        finally:
+            gc.enable()
+
+    return cast(F, quiet)
 
 
 def recorded(run: Callable[..., Any]) -> Callable[..., Any]:

@@ -9,7 +9,7 @@ import drjit as dr
 
 from . import _binning, _project
 from . import constants as c
-from ._backend import Backend, larger, packet, power_of_two, write, write_packet
+from ._backend import Backend, larger, packet, power_of_two, undisturbed, write, write_packet
 from ._blend import Blended, blend
 from ._blend_backward import blend_backward
 from ._project import RECORD, Arrays
@@ -72,6 +72,7 @@ class Trace:
         return [*(chunk.image.features for chunk in self.chunks), covered]
 
 
+@undisturbed
 def render(trace: Trace, arrays: Arrays) -> list[Any]:
     """Render N >= 1 splats into an empty trace and return its image, unless `projected.nonfinite` says otherwise."""
     features = arrays.columns + int(trace.settings.has_depth)
@@ -82,12 +83,14 @@ def render(trace: Trace, arrays: Arrays) -> list[Any]:
     return trace.image()
 
 
+@undisturbed
 def queue(be: Backend, arrays: Arrays, settings: Settings, features: int) -> _project.Queued:
     """Begin to project N >= 1 splats."""
     camera = _project.read_camera(be, arrays, settings)
     return _project.run(be, arrays, features, min(features, CHUNK), camera, settings)
 
 
+@undisturbed
 def geometry(be: Backend, arrays: Arrays, settings: Settings, features: int) -> Trace:
     """Project N >= 1 splats and list them tile by tile; check `projected.nonfinite` before going on."""
     trace = Trace(be, settings)
@@ -98,6 +101,7 @@ def geometry(be: Backend, arrays: Arrays, settings: Settings, features: int) -> 
     return trace
 
 
+@undisturbed
 def shade(
     trace: Trace, colors: Any, columns: int, features: int, opacities: Any | None = None, fresh: bool = False
 ) -> None:
@@ -146,7 +150,9 @@ class Wanted:
     opacities: bool
     colors: bool
     camera: bool
-    outputs: bool = False  # what the projection makes of the splats
+    means2d: bool = False  # what the projection makes of the splats
+    conics: bool = False
+    depths: bool = False
     absolute: bool = False  # the means' absolute gradients, added up pixel by pixel
 
 
@@ -156,7 +162,7 @@ class Gradients:
 
     inputs: InputGradients
     colors: Any | None  # [N * D]
-    outputs: OutputGradients = field(default_factory=OutputGradients)
+    outputs: OutputGradients
 
 
 _capacities: set[int] = set()
@@ -176,6 +182,7 @@ def capacity(n: int) -> int:
     return min(fitting)
 
 
+@undisturbed
 def backward(
     trace: Trace, arrays: Arrays, grad_features: list[Any], grad_coverage: Any | None, wanted: Wanted
 ) -> Gradients:
@@ -223,14 +230,13 @@ def backward(
         else:
             inputs = opacity_adjoint(be, arrays.opacities, p.visible, sums, wanted.opacities)
         dr.eval(grad_colors)
-    outputs = OutputGradients()
-    if wanted.outputs:
-        outputs = replace(output_gradients(be, p.records, p.visible, sums, False), depths=grad_depth)
-    if wanted.absolute:
-        outputs = replace(outputs, absolute=output_gradients(be, p.records, p.visible, sums, True).absolute)
-    return Gradients(inputs, grad_colors, outputs)
+    outputs = output_gradients(
+        be, p.records, p.visible, sums, means2d=wanted.means2d, conics=wanted.conics, absolute=wanted.absolute
+    )
+    return Gradients(inputs, grad_colors, replace(outputs, depths=grad_depth if wanted.depths else None))
 
 
+@undisturbed
 def outputs_backward(trace: Trace, arrays: Arrays, given: OutputGradients, with_camera: bool) -> InputGradients:
     """Gradients of the inputs from those of what the projection makes of N >= 1 splats."""
     be, p = trace.be, trace.projected

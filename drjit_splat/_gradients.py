@@ -111,8 +111,8 @@ def blend_gradients(
     grad_coverage: Tensor,
 ) -> BlendGradients:
     """Replay the blending of all images and what led to it."""
-    outputs = bool(call.looked)
-    wanted = wanted_of(asked, call.batches, colors=colors_asked, outputs=outputs, absolute=call.absgrad)
+    looked = {name: name in call.looked for name in BETWEEN}
+    wanted = wanted_of(asked, call.batches, colors=colors_asked, absolute=call.absgrad, **looked)
     sums = _Sums(call, inputs)
     result = BlendGradients([], [], [])
     absolute = []

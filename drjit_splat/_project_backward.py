@@ -72,26 +72,32 @@ def seeds_of_outputs(be: Backend, records: Any, given: OutputGradients, i: Any) 
     return [x, y, dr.fma(h, dr.fma(h, yy, xy), xx), a * dr.fma(2 * h, yy, xy), yy, zero]
 
 
-def output_gradients(be: Backend, records: Any, visible: Any, gradients: list[Any], absolute: bool) -> OutputGradients:
-    """Gradients of means and conics from the moments; of the absolute ones only what is asked for."""
+def output_gradients(
+    be: Backend, records: Any, visible: Any, gradients: list[Any], *, means2d: bool, conics: bool, absolute: bool
+) -> OutputGradients:
+    """Gradients of means and conics, and the means' absolute ones, from the moments; what is asked for."""
+    if not (means2d or conics or absolute):
+        return OutputGradients()
     J = be.plain
     n = dr.width(visible)
     i = dr.arange(J.UInt32, n)
     m = total_moments(be, gradients, i)
     _, _, a, h, d = packet(be, records, i * (RECORD // 8), 8)[:5]
 
-    def written(values: list[Any]) -> Any:
+    def written(asked: bool, *values: Any) -> Any:
+        if not asked:
+            return None
         target = dr.empty(J.Float, n * len(values))
         for k, value in enumerate(values):
             write(target, dr.select(visible, value, 0.0), len(values) * i + k)
         return target
 
-    if absolute:
-        found = OutputGradients(absolute=written([2 * LN2 * a * m[6], 2 * LN2 * m[7]]))
-    else:
+    found = OutputGradients(
+        means2d=written(means2d, *_mean_gradient(m, a, h, d)),
         # In the pixel's own axes dx = s - h t.
-        conics = [-0.5 * (m[3] - h * (2 * m[4] - h * m[5])), -(m[4] - h * m[5]), -0.5 * m[5]]
-        found = OutputGradients(written(_mean_gradient(m, a, h, d)), written(conics))
+        conics=written(conics, -0.5 * (m[3] - h * (2 * m[4] - h * m[5])), -(m[4] - h * m[5]), -0.5 * m[5]),
+        absolute=written(absolute, 2 * LN2 * a * m[6], 2 * LN2 * m[7]),
+    )
     dr.eval(found.means2d, found.conics, found.absolute)
     return found
 

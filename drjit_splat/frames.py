@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import _core
-from ._backend import RECORDINGS, TILE, Backend, backend_named, exclusive, larger, recorded, smaller, write
+from ._backend import RECORDINGS, TILE, Backend, backend_named, exclusive, larger, recorded, smaller, undisturbed, write
 from ._binning import TileLists, build, empty
 from ._blend import accumulate
 from ._project import Arrays, Queued
@@ -49,6 +49,7 @@ class ProjectedFrame:
     queued: Queued
 
     @exclusive
+    @undisturbed
     def blend(self, background: Any, like: Frame | None = None) -> Frame:
         """Wait for the projection and begin to blend.
 
@@ -74,6 +75,7 @@ class ProjectedFrame:
 
 
 @exclusive
+@undisturbed
 def project_frame(
     means: Any,
     quats: Any,
