@@ -150,6 +150,8 @@ def _render(arguments: argparse.Namespace) -> int:
     from . import load_ply, rasterization
 
     splats = load_ply(arguments.scene)
+    if not len(splats.means):
+        raise ValueError(f"{arguments.scene} holds no splats")
     if arguments.camera:
         view = load_camera(arguments.camera, arguments.index)
     else:

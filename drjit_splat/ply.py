@@ -77,6 +77,8 @@ def _read_header(path: Path) -> _Header:
     elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
     first = lines[elements[0]] if elements else []
     if first[1:2] != ["vertex"] or not first[-1].isdigit() or len(first[-1]) > 18:
+        if first[1:2] == ["chunk"] or any(line[-1:] == ["packed_position"] for line in lines):
+            raise ValueError(f"{path} is a compressed .ply; export it uncompressed")
         raise ValueError(f"{path} must start with one 'element vertex <count>'")
     properties = []
     for line in lines[: elements[1] if len(elements) > 1 else None]:

@@ -128,6 +128,8 @@ def _over(mi: Any, behind: Any, splats: Tensor, left: Tensor) -> Any:
 def _opencv(mi: Any, sensor: Any) -> tuple[Tensor, Tensor, int, int]:
     """Matrices and size of a perspective sensor, see `scenes.head_scene`."""
     params = mi.traverse(sensor)
+    if "x_fov" not in params or "principal_point_offset_x" not in params:
+        raise ValueError(f"the integrator '{NAME}' needs a perspective sensor")
     width, height = (int(value) for value in sensor.film().crop_size())
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
     viewmat = np.linalg.inv(to_world @ np.diag([-1.0, -1.0, 1.0, 1.0]))

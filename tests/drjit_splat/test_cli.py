@@ -102,3 +102,12 @@ def test_help_fits_a_screen_and_has_an_example(
     out = capsys.readouterr().out
     assert "Example: drjit-splat render" in out
     assert out.count("\n") <= 40 and max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("comments", [(), ("made: here",), ("one", "two")])
+def test_a_scene_without_splats_is_said_to_have_none(comments: tuple[str, ...], tmp_path: Path, capsys) -> None:
+    empty = {name: torch.zeros(0, size) for name, size in (("means", 3), ("quats", 4), ("scales", 3), ("colors", 3))}
+    save_ply(tmp_path / "zero.ply", **empty, opacities=torch.zeros(0), comments=comments)
+    assert main(["render", str(tmp_path / "zero.ply"), "-o", str(tmp_path / "o.png")]) == 2
+    assert "zero.ply holds no splats" in capsys.readouterr().err
+    assert not (tmp_path / "o.png").exists()

@@ -136,3 +136,13 @@ def test_wrong_tensors_are_named(tmp_path: Path) -> None:
         save_ply(tmp_path / "a.ply", **(splats() | {"quats": torch.zeros(40, 3)}))
     with pytest.raises(ValueError, match=r"^colors must have 1, 4, 9 or 16"):
         save_ply(tmp_path / "a.ply", **splats(harmonics=5))
+
+
+@pytest.mark.parametrize("first", ["chunk 2", "vertex 256", "sh 256"])
+def test_compressed_files_are_called_so(first: str, tmp_path: Path) -> None:
+    packed = ["property uint packed_position", "property uint packed_rotation"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element {first}", "property float min_x"]
+    lines += ["element vertex 256", *packed, "end_header", ""]
+    (tmp_path / "c.ply").write_bytes("\n".join(lines).encode() + bytes(9000))
+    with pytest.raises(ValueError, match=r"c\.ply (is a compressed \.ply|has no property)"):
+        load_ply(tmp_path / "c.ply")

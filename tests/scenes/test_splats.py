@@ -150,3 +150,14 @@ def test_a_missing_avatar_is_named(tmp_path: Path) -> None:
 def test_the_head_stands_among_other_scenes() -> None:
     head_scene = load_head_scene(sphere_head(), 16, 16, "studio", "direct")
     assert head_scene.shape("head") is not None and head_scene.shape("nobody") is None
+
+
+@pytest.mark.parametrize("kind", ["orthographic", "thinlens", "radiancemeter"])
+def test_sensors_without_a_pinhole_are_named(kind: str, avatar: tuple[Avatar, Path], tmp_path: Path) -> None:
+    mi = scenes.load_mitsuba()
+    scene = scene_file(tmp_path, avatar[1], 0.1)
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "filter": {"type": "box"}}
+    more = {"aperture_radius": 0.1, "focus_distance": 1.0} if kind == "thinlens" else {}
+    sensor = mi.load_dict({"type": kind, "film": film, **more})
+    with pytest.raises((ValueError, RuntimeError), match="gaussian_splats' needs a perspective sensor"):
+        scene.integrator().render(scene, sensor)

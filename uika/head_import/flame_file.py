@@ -95,6 +95,10 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
         try:
             return read_npz(source)
         except ArraysError as error:
+            if _is_torch(source):
+                raise HeadError(
+                    f"{source}: is a PyTorch file; give the .pkl that FLAME comes as, or an .npz"
+                ) from error
             raise HeadError(f"{source}: cannot be read as an .npz of plain arrays: {error}") from error
     if source.suffix == ".npz":
         raise HeadError(f"{source}: is damaged or no .npz file; fetch it again")
@@ -102,6 +106,11 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
         return read_arrays(source)
     except UnpickleError as error:
         raise HeadError(str(error)) from error
+
+
+def _is_torch(source: Path) -> bool:
+    with zipfile.ZipFile(source) as archive:
+        return any(name.endswith(("/data.pkl", "/constants.pkl")) for name in archive.namelist())
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:
@@ -158,7 +167,21 @@ def _read_obj(path: Path) -> tuple[Tensor, Tensor, Tensor]:
             f"{path}: has {vertices} vertices, {len(uvs)} texture coordinates and {len(faces)} triangles; "
             f"a FLAME mesh has {VERTICES} vertices and needs the other two"
         )
-    return torch.tensor(faces), torch.tensor(uvs), torch.tensor(uv_faces)
+    try:
+        return _topology(torch.tensor(faces), torch.tensor(uvs), torch.tensor(uv_faces))
+    except HeadError as error:
+        raise HeadError(f"{path}: {error}") from error
+
+
+def _topology(faces: Tensor, uvs: Tensor, uv_faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same, if every triangle's corners exist."""
+    for name, index, count in (("vertex", faces, VERTICES), ("texture coordinate", uv_faces, len(uvs))):
+        wrong = index[(index < 0) | (index >= count)]
+        if len(wrong):
+            raise HeadError(f"a triangle names {name} number {int(wrong[0]) + 1}; there are {count:,}")
+    if faces.shape != uv_faces.shape or faces.ndim != 2 or faces.shape[1] != 3:
+        raise HeadError(f"has triangles of shape {list(faces.shape)} and texture triangles {list(uv_faces.shape)}")
+    return faces, uvs, uv_faces
 
 
 def _index(word: str, count: int) -> int:

@@ -20,7 +20,7 @@ MAX_BYTES = 1 << 29  # of a file, and of all arrays in it; FLAME's take a fifth
 _MAX_MEMO = 10_000_000  # the unpickler allocates as many slots as the largest memo index asks for
 _MAX_DENSE = 1 << 22  # entries of a sparse matrix; a joint regressor has 25 thousand
 _REFUSED_OPCODES = {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
-_SPARSE = ("csc_matrix", "csr_matrix")
+_SPARSE = ("csc", "csr", "coo")
 
 
 class UnpickleError(ValueError):
@@ -63,6 +63,10 @@ class _Columns(_Sparse):
 
 class _Rows(_Sparse):
     pass
+
+
+class _Entries(_Sparse):
+    """A scipy sparse matrix as entries: state {"data", "row", "col"} or {"data", "coords": (row, column)}."""
 
 
 class _Scalar(_Record):
@@ -128,9 +132,9 @@ def _globals() -> dict[tuple[str, str], Callable[..., Any]]:
     known["collections", "OrderedDict"] = known["collections", "defaultdict"] = _Container
     for module in ("chumpy", "chumpy.ch"):
         known[module, "Ch"] = _Chumpy
-    for name, kind in zip(_SPARSE, (_Columns, _Rows), strict=True):
-        for module in (f"scipy.sparse.{name[:3]}", f"scipy.sparse._{name[:3]}", "scipy.sparse"):
-            known[module, name] = kind
+    for name, kind in zip(_SPARSE, (_Columns, _Rows, _Entries), strict=True):
+        for module in (f"scipy.sparse.{name}", f"scipy.sparse._{name}", "scipy.sparse"):
+            known[module, f"{name}_matrix"] = known[module, f"{name}_array"] = kind
     return known
 
 
@@ -244,15 +248,27 @@ def _chumpy(record: _Chumpy) -> np.ndarray:
 def _dense(record: _Sparse) -> np.ndarray:
     state = record.state
     shape = state.get("_shape", state.get("shape"))
-    data, indices, indptr = (_plain(state[name]) for name in ("data", "indices", "indptr"))
-    if len(shape) != 2 or shape[0] * shape[1] > _MAX_DENSE:
+    if len(shape) != 2 or not 0 <= shape[0] * shape[1] <= _MAX_DENSE or min(shape) < 0:
         raise UnpickleError(f"holds a sparse matrix of shape {shape}; larger than a head model needs")
+    if isinstance(record, _Entries):
+        return _from_entries(state, shape)
+    data, indices, indptr = (_plain(state[name]) for name in ("data", "indices", "indptr"))
     if len(data) != len(indices) or len(indptr) < 1 or int(indptr[-1]) != len(data) or (np.diff(indptr) < 0).any():
         raise UnpickleError("holds a sparse matrix whose columns and values do not fit together")
     major = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
     matrix = np.zeros(tuple(int(n) for n in shape), data.dtype)
     place = (indices, major) if isinstance(record, _Columns) else (major, indices)
     np.add.at(matrix, place, data)
+    return matrix
+
+
+def _from_entries(state: dict[str, Any], shape: tuple[int, int]) -> np.ndarray:
+    row, column = state["coords"] if "coords" in state else (state["row"], state["col"])
+    data, rows, columns = (_plain(part) for part in (state["data"], row, column))
+    if not len(data) == len(rows) == len(columns):
+        raise UnpickleError("holds a sparse matrix whose places and values do not fit together")
+    matrix = np.zeros(tuple(int(n) for n in shape), data.dtype)
+    np.add.at(matrix, (rows, columns), data)
     return matrix
 
 
