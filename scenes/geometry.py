@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from uika.head import HeadModel, vertex_normals
+from uika.head.seams import cut_seams
 
 _MIN_FACING = 0.05
 
@@ -37,9 +38,8 @@ class SeamMesh:
         return bent.numpy()[self.source]
 
 
-def cut_seams(head: HeadModel) -> SeamMesh:
-    """Double the vertices along the head's UV seams."""
-    pairs = torch.stack((head.faces.flatten(), head.uv_faces.flatten()), -1).numpy()
-    distinct, corner = np.unique(pairs, axis=0, return_inverse=True)
+def seam_mesh(head: HeadModel) -> SeamMesh:
+    """The head's mesh with its UV seams cut open."""
+    distinct, triangles = cut_seams(head)
     u, v = head.uvs.numpy()[distinct[:, 1]].T
-    return SeamMesh(distinct[:, 0], np.stack((u, 1 - v), -1), corner.reshape(-1, 3).astype(np.uint32))
+    return SeamMesh(distinct[:, 0].numpy(), np.stack((u, 1 - v), -1), triangles.numpy().astype(np.uint32))

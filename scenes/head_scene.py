@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from scenes.arrays import aligned
-from scenes.geometry import SeamMesh, cut_seams
+from scenes.geometry import SeamMesh, seam_mesh
 from scenes.people.glasses import Glasses, glasses_topology
 from scenes.variant import keeping_variant, load_mitsuba, single_threaded
 from uika.errors import UikaError
@@ -150,7 +150,7 @@ def load_head_scene(head: HeadModel, width: int, height: int, light: Light, inte
             f"light must be one of {LIGHTS} and integrator of {INTEGRATORS}, not {light!r}, {integrator!r}"
         )
     mi = load_mitsuba()
-    mesh = cut_seams(head)
+    mesh = seam_mesh(head)
     # Scene files take meshes and textures by file name only; the files are read at once and can go.
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -119,7 +119,7 @@ def test_photo_reconstructs(installed: Installed) -> None:
         "talk.mp4",
         "sheet.png",
     }
-    installed.run("uika", "track", "demo/talk.mp4", "-o", "motion.npz", "--count", "3")
+    installed.run("uika", "track", "demo/talk.mp4", "-o", "motion.npz")
 
 
 @only("scenes")

@@ -12,6 +12,7 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.export.texture import uv_tiles
 from uika.head import HeadModel, HeadParameters, rest_joints, vertex_normals
+from uika.head.seams import cut_seams
 
 _INFLUENCES = 4  # joints a vertex, the most that glTF's first set holds
 
@@ -41,9 +42,7 @@ def skinned_mesh(avatar: Avatar, head: HeadModel) -> SkinnedMesh:
     """
     avatar.check_head(head)
     tiles = uv_tiles(head)
-    corners = torch.stack((head.faces, head.uv_faces, tiles[:, None].expand(-1, 3)), -1)
-    found, place = corners.flatten(0, 1).unique(dim=0, return_inverse=True)
-    triangles = place.view(-1, 3)
+    found, triangles = cut_seams(head, tiles)
     vertex, uv, tile = found.unbind(-1)
     canonical = avatar.canonical_vertices(head)
     uvs = torch.stack((head.uvs[uv, 0] - tile, 1 - head.uvs[uv, 1]), -1)
