@@ -37,3 +37,11 @@ def test_linked_files_exist(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         if not target.startswith(("http://", "https://", "mailto:")):
             assert (page.parent / target).exists(), f"{page.name} links {target}"
+
+
+def test_the_site_shows_every_page_once_in_four_groups() -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    navigation = text[text.index("\nnav:") :]
+    assert sorted(re.findall(r": ([\w-]+\.md)$", navigation, re.MULTILINE)) == sorted(page.name for page in PAGES[1:])
+    groups = re.findall(r"^  - (.+):$", navigation, re.MULTILINE)
+    assert groups == ["Start", "Guides", "How it works", "Results and reference"]
