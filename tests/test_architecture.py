@@ -1,4 +1,4 @@
-"""Which room may import which (docs/architecture.md), held against every import in the code."""
+"""Which package may import which (docs/architecture.md), held against every import in the code."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-# Room -> rooms of the project that it may import; a room is the folder that stands here with the longest path.
-ROOMS: dict[str, set[str]] = {
+# Package -> packages of the project that it may import; a package is the folder that stands here with the longest path.
+PACKAGES: dict[str, set[str]] = {
     "drjit_splat": set(),
     "uika": set(),  # the package itself: errors, version; its public names are loaded when asked for
     "uika.assets": set(),
@@ -30,15 +30,17 @@ ROOMS: dict[str, set[str]] = {
     "uika.export": {"uika.avatar", "uika.motion", "uika.head", "uika.io", "drjit_splat"},
     "uika.safeguards": {"uika.avatar", "uika.export", "uika.io"},
 }
-ROOMS["uika.reconstruction"] = {
-    room for room in ROOMS if room not in ("uika.tracking", "uika.export", "uika.safeguards", "uika.metrics")
+PACKAGES["uika.reconstruction"] = {
+    package
+    for package in PACKAGES
+    if package not in ("uika.tracking", "uika.export", "uika.safeguards", "uika.metrics")
 }
-ROOMS["scenes"] = {"uika.head", "uika.avatar", "uika.canonical", "uika.io", "drjit_splat"}
-ROOMS["uika.data"] = {*ROOMS} - {"uika.reconstruction"}
-BELOW = set(ROOMS)
-for _room in ("uika.train", "uika.evaluate", "uika.viewer"):
-    ROOMS[_room] = set(BELOW)
-ROOMS["uika.cli"] = set(ROOMS)
+PACKAGES["scenes"] = {"uika.head", "uika.avatar", "uika.canonical", "uika.io", "drjit_splat"}
+PACKAGES["uika.data"] = {*PACKAGES} - {"uika.reconstruction"}
+BELOW = set(PACKAGES)
+for _package in ("uika.train", "uika.evaluate", "uika.viewer"):
+    PACKAGES[_package] = set(BELOW)
+PACKAGES["uika.cli"] = set(PACKAGES)
 LONGEST = 300  # lines
 TOP = {"__init__", "__main__", "_version", "errors"}
 
@@ -54,8 +56,8 @@ def module_of(path: Path) -> str:
 MODULES = {module_of(path): path for path in sources()}
 
 
-def room_of(module: str) -> str:
-    return max((room for room in ROOMS if module == room or module.startswith(f"{room}.")), key=len)
+def package_of(module: str) -> str:
+    return max((package for package in PACKAGES if module == package or module.startswith(f"{package}.")), key=len)
 
 
 def imported(module: str, tree: ast.AST) -> Iterator[tuple[int, str]]:
@@ -79,19 +81,19 @@ def trees() -> dict[str, ast.Module]:
 
 
 def forbidden(module: str, tree: ast.AST) -> list[str]:
-    """Imports of a module that leave what its room may import."""
-    room, found = room_of(module), []
+    """Imports of a module that leave what its package may import."""
+    package, found = package_of(module), []
     for line, name in imported(module, tree):
         top = name.partition(".")[0]
         if top in ("benchmarks", "tests", "tools", "examples"):
             found.append(f"{module}:{line} imports {name}: the product knows nothing of it")
-        elif top == "mitsuba" and room != "scenes":
+        elif top == "mitsuba" and package != "scenes":
             found.append(f"{module}:{line} imports mitsuba, which only scenes does")
         elif top in ("uika", "drjit_splat", "scenes"):
-            other = room_of(name)
+            other = package_of(name)
             lower = module == "uika" or module == "uika.__main__"  # public names, and the command line
-            if other not in (room, "uika") and other not in ROOMS[room] and not lower:
-                found.append(f"{module}:{line} imports {name}: {room} may not import {other}")
+            if other not in (package, "uika") and other not in PACKAGES[package] and not lower:
+                found.append(f"{module}:{line} imports {name}: {package} may not import {other}")
     return found
 
 
@@ -99,16 +101,16 @@ def test_nothing_is_imported_upwards() -> None:
     assert [line for module, tree in trees().items() for line in forbidden(module, tree)] == []
 
 
-def test_the_table_has_no_circle_and_knows_every_room() -> None:
+def test_the_table_has_no_circle_and_knows_every_package() -> None:
     order: list[str] = []
-    left = {room: {other for other in others if other != room} for room, others in ROOMS.items()}
+    left = {package: {other for other in others if other != package} for package, others in PACKAGES.items()}
     while left:
-        ready = [room for room, others in left.items() if others <= set(order)]
-        assert ready, f"these rooms import each other: {sorted(left)}"
+        ready = [package for package, others in left.items() if others <= set(order)]
+        assert ready, f"these packages import each other: {sorted(left)}"
         order += ready
-        left = {room: others for room, others in left.items() if room not in ready}
+        left = {package: others for package, others in left.items() if package not in ready}
     folders = {f"uika.{path.parent.name}" for path in (ROOT / "uika").glob("*/__init__.py")}
-    assert folders <= set(ROOMS), f"rooms without a line in the table: {sorted(folders - set(ROOMS))}"
+    assert folders <= set(PACKAGES), f"packages without a line in the table: {sorted(folders - set(PACKAGES))}"
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
@@ -156,18 +158,18 @@ def test_the_top_of_the_package_is_empty() -> None:
 
 
 def documented() -> dict[str, set[str]]:
-    """The table of docs/architecture.md: room -> rooms that it may import."""
-    rooms: dict[str, set[str]] = {}
+    """The table of docs/architecture.md: package -> packages that it may import."""
+    packages: dict[str, set[str]] = {}
     for line in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 3 and cells[0].startswith("`"):
-            named, above = set(re.findall(r"`([\w.]+)`", cells[2])), set(rooms)
-            rooms[cells[0].strip("`")] = above - named if cells[2].startswith("all above") else named
-    return rooms
+            named, above = set(re.findall(r"`([\w.]+)`", cells[2])), set(packages)
+            packages[cells[0].strip("`")] = above - named if cells[2].startswith("all above") else named
+    return packages
 
 
 def test_the_documentation_tells_the_same_rules() -> None:
-    assert documented() == ROOMS
+    assert documented() == PACKAGES
 
 
 @pytest.mark.parametrize(
