@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from uika.canonical.regions import REGIONS, at_texels, mask_at_texels, regions
+from uika.canonical.eyes import complete_eyes
+from uika.canonical.mouth import hidden_mouth
+from uika.canonical.regions import EYEBALLS, MOUTH, TEETH, at_texels, mask_at_texels, regions
+from uika.canonical.tint import tone
 from uika.head import Binding, HeadModel
+from uika.head.mesh_parts import tongue
 
-# sRGB colours under even light of parts that lids and lips hide: no skin may appear there when they open.
-_HIDDEN = {"eyeballs": (0.75, 0.71, 0.69), "mouth_inner": (0.36, 0.15, 0.14), "teeth": (0.80, 0.77, 0.71)}
 _HAIR_DEPTH = 0.012  # metres that hair stands off the scalp where it surely is hair
 _BARE = 0.1  # hairiness up to which the face counts as bare skin
 _SOURCE = 30.0  # pull of a fully seen vertex towards its own colour, relative to an edge
@@ -55,8 +57,18 @@ def prior_colors(
     points = at_texels(head, binding, head.template)
     hairy = at_texels(head, binding, hair[:, None])[:, 0] * (labels == 0)
     result = (result + reflected_hair_detail(points, observed, result, seen, hairy)).clamp(0, 1)
-    for index, name in enumerate(REGIONS):
-        result[labels == index + 1] = brightness * torch.tensor(_HIDDEN[name])
+    # No skin may appear where lids and lips open.
+    known_share = binding.from_map(known[None])[:, 0]
+    shown = tone(observed, known_share, (labels == 0) & (hairy < _BARE))
+    if "eyeballs" in head.masks:
+        ball = labels == EYEBALLS
+        eyes = complete_eyes(head, points, ball, observed, known_share, brightness, shown)
+        result[ball] = eyes[ball]
+    if "mouth_inner" in head.masks:
+        inner = labels >= MOUTH
+        on_tongue = at_texels(head, binding, tongue(head)[:, None].float())[:, 0] > 0.5
+        mouth = hidden_mouth(head, points, inner, on_tongue, labels == TEETH)
+        result[inner] = shown.apply(brightness * mouth[inner])
     return binding.to_map(result, fill=torch.nan)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from uika.head import Binding, HeadModel
 
 REGIONS = ("eyeballs", "mouth_inner", "teeth")  # labelled 1, 2, 3; skin and hair are 0
-MOUTH = 2
+EYEBALLS, MOUTH, TEETH = 1, 2, 3
 
 
 def regions(head: HeadModel, binding: Binding) -> Tensor:

@@ -13,6 +13,7 @@ from uika.fitting.hair import fit_hair
 from uika.fitting.landmark_bias import unbiased
 from uika.fitting.landmarks import fit_landmarks
 from uika.fitting.refinement import Gain, refine_landmark_fit
+from uika.fitting.teeth import teeth_offset
 from uika.head import Camera, HeadModel, HeadParameters
 
 
@@ -35,6 +36,7 @@ class Fit:
     parameters: [N] head parameters with one identity; the cameras carry the head's pose.
     cameras: [N] cameras at the crops' size. static_offset [V,3] metres, the hair's displacement of the neutral head.
     error [N]: mean landmark distance in outer eye-corner distances. gain: of the refinement by colours, if it ran.
+    landmarks [N,478,2]: as detected, crop pixels, where they are known.
     """
 
     parameters: HeadParameters
@@ -42,6 +44,7 @@ class Fit:
     static_offset: Tensor
     error: Tensor
     gain: Gain | None = None
+    landmarks: Tensor | None = None
 
 
 def fit_photos(
@@ -96,7 +99,7 @@ def fit_photos(
     parameters = HeadParameters.zeros(head, N).replace(
         identity=found.identity.float().expand(N, -1).contiguous(), expression=found.expression.float()
     )
-    offset = torch.zeros_like(head.template) if known is None else known.static_offset
+    offset = teeth_offset(head) if known is None else known.static_offset
     if head_mattes is not None and known is None:
-        offset = fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
-    return Fit(parameters, cameras, offset, found.error.float(), gain)
+        offset = offset + fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
+    return Fit(parameters, cameras, offset, found.error.float(), gain, torch.stack([p.landmarks for p in photos]))

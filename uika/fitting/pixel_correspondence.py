@@ -7,12 +7,12 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from uika.fitting.fit import Fit
+from uika.fitting.part_trust import lid_doubt, opening_trust
 from uika.fitting.weights import PIXEL_FACING, PIXEL_GRAZING
 from uika.head import HeadModel, pose_vertices, project, rasterize, vertex_normals
 
 SURE_MATTE, FULL_MATTE = 0.7, 0.98  # matte values between which a pixel gains weight: edges carry background light
 EDGE = 2  # pixels inside the matte's edge that are not trusted
-LID_DOUBT = 0.8  # an open eye shows the lid in the shadow of its fold and lashes; shut, it is mostly skin
 
 
 def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -46,8 +46,10 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         cosine = (normal * normalize(camera.position - surface, dim=-1)).sum(-1)
         inner = -max_pool2d(-matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
         trust = _ramp(inner, SURE_MATTE, FULL_MATTE) * _ramp(cosine, PIXEL_GRAZING, PIXEL_FACING)
-        if "eyes" in head.masks:
-            trust = trust * (1 - LID_DOUBT * (head.masks["eyes"][corners] * mix).sum(-1))
+        trust = trust * (1 - (lid_doubt(head, fit.parameters[n], fit.static_offset)[corners] * mix).sum(-1))
+        if fit.landmarks is not None and {"eyeballs", "mouth_inner"} <= set(head.masks):
+            shares = ((head.masks[name][corners] * mix).sum(-1) * hit for name in ("eyeballs", "mouth_inner"))
+            trust = trust * opening_trust(fit.landmarks[n], size, *shares)
         seen = hit & (trust > 0)
         uv.append(torch.where(seen[..., None], place, torch.zeros(())))
         valid.append(seen)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from uika.canonical.surface import SurfaceTexels
 from uika.model.config import UvConfig
-from uika.uv import Sums, fill, pool
+from uika.uv import Sums, fill, mirror_preference, pool
 
 
 class Observation(NamedTuple):
@@ -34,6 +34,8 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
     color = pooled.rgb
     if config.fill:
         share = (pooled.trust / config.full_trust).clamp(0, 1)
+        if surface.mirror is not None:
+            share = share * mirror_preference(pooled.trust, valid, surface.mirror)
         color = fill(color, share, valid, surface.mirror, regions=surface.regions, prior=surface.prior)
     report = {
         "views": len(views),

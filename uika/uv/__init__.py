@@ -3,6 +3,7 @@
 from uika.uv.aggregation import Aggregate, aggregate, pool
 from uika.uv.filling import diffuse, fill
 from uika.uv.holes import close_holes
+from uika.uv.mirroring import mirror_preference
 from uika.uv.reprojection import Sums, accumulate, accumulate_sizes, reproject, view_images
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "close_holes",
     "diffuse",
     "fill",
+    "mirror_preference",
     "pool",
     "reproject",
     "view_images",
