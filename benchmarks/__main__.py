@@ -44,6 +44,7 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "synthesis_quality": ("--sheet", "2", "--people", "1", "--size", "64"),
     "scene_validation": ("--poses", "1", "--views", "1"),
     "synthesis_speed": ("--sizes", "64", "--identities", "1", "--frames", "1"),
+    "synthesis_scale": ("--size", "64", "--moments", "2", "--opened", "50"),
     "watermark": ("--pictures", "2", "--unmarked", "6"),
     "endurance": ("--steps", "6", "--frames", "6"),
 }

@@ -73,18 +73,18 @@ def split(avatar: Avatar, motion: Motion, head: HeadModel, size: int, count: int
     picture = None
     for first in range(0, count, 16):
         start = time.perf_counter()
-        vertices, turns = renderer.meshes(params[first : first + 16])
-        found.setdefault("meshes", []).append(1e3 * (time.perf_counter() - start) / len(vertices))
-        for mesh, turn, camera in zip(vertices, turns, cameras[first : first + 16].viewmat, strict=True):
+        meshes = renderer.meshes(params[first : first + 16])
+        found.setdefault("meshes", []).append(1e3 * (time.perf_counter() - start) / len(meshes))
+        for mesh, camera in zip(meshes, cameras[first : first + 16].viewmat, strict=True):
             view = replace(cameras[first], viewmat=camera)
             dr.sync_thread()
             start = time.perf_counter()
-            renderer.rig.pose(mesh, turn)
+            renderer.gaussians(mesh)
             dr.sync_thread()
             found.setdefault("pose", []).append(1e3 * (time.perf_counter() - start))
             with profile() as report:
                 start = time.perf_counter()
-                picture = renderer.blend(renderer.project(mesh, turn, view), picture)
+                picture = renderer.blend(renderer.project(mesh, view), picture)
                 dr.sync_thread()
                 found.setdefault("frame", []).append(1e3 * (time.perf_counter() - start))
             for name, spent in report.stages.items():

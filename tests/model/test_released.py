@@ -214,7 +214,7 @@ def test_estimator_file(
 
 
 def test_damaged_and_missing_files(file: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no such model file"):
+    with pytest.raises(CheckpointError, match="no such weight file"):
         released.load(tmp_path / "nowhere.safetensors")
     stump = tmp_path / "stump.safetensors"
     stump.write_bytes(file.read_bytes()[:5000])

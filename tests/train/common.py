@@ -38,6 +38,7 @@ CONFIG = TrainConfig(
     size=SIZE,
     fitted=0.0,
     augment=False,
+    backgrounds=(1.0,),
     warmup=1,
     ema=0.9,
     save_every=2,

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -23,6 +23,8 @@ from uika.head import (
 )
 from uika.io.files import write_tensors
 
+Skinning = Literal["surface", "released"]
+SKINNINGS: tuple[Skinning, ...] = ("surface", "released")
 FORMAT = "uika-avatar"
 VERSION = "1"
 
@@ -49,6 +51,7 @@ class Avatar:
     triangle: Tensor  # [M] int64, triangle that carries each Gaussian
     barycentric: Tensor  # [M,3] its surface point
     provenance: Mapping[str, str] = field(default_factory=dict)
+    skinning: Skinning = "surface"  # how it is moved, see `pose`
 
     def __post_init__(self) -> None:
         """Check shapes, types and values.
@@ -77,6 +80,8 @@ class Avatar:
                 )
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 raise AvatarError(f"avatar tensor '{name}' holds values that are not finite")
+        if self.skinning not in SKINNINGS:
+            raise AvatarError(f"avatar is moved by '{self.skinning}', which must be one of {', '.join(SKINNINGS)}")
         if count == 0:
             raise AvatarError("avatar has no Gaussians")
         if bool((self.scales < 0).any()) or bool((self.triangle < 0).any()):
@@ -96,6 +101,7 @@ class Avatar:
             "version": VERSION,
             "head_id": self.head_id,
             "provenance": json.dumps(dict(self.provenance), sort_keys=True),
+            "skinning": self.skinning,
         }
         write_tensors(path, tensors, metadata)
 
@@ -111,9 +117,9 @@ class Avatar:
         if not source.is_file():
             reason = "is a directory, not an avatar file" if source.is_dir() else "no such avatar file"
             raise AvatarError(f"{source}: {reason}; `uika reconstruct` makes one from photos")
-        head_id, provenance, tensors = _read(source)
+        parts = _read(source)
         try:
-            return Avatar(head_id=head_id, provenance=provenance, **tensors)
+            return Avatar(**parts)
         except AvatarError as error:
             raise AvatarError(f"{source}: {error}") from error
 
@@ -148,7 +154,7 @@ class Avatar:
         params: HeadParameters,
         head: HeadModel,
         canonical: Tensor | None = None,
-        skinning: Literal["surface", "released"] = "surface",
+        skinning: Skinning | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Move the Gaussians with the head.
 
@@ -157,7 +163,7 @@ class Avatar:
             head: the head model that the avatar was made for.
             canonical: [V,3] the result of `canonical_vertices`, to save time over many frames.
             skinning: "surface" turns and scales each Gaussian with the surface it lies on; "released" skins centres
-                only and keeps rotations and scales, as the authors' released model does.
+                only and keeps rotations and scales, as the authors' released model does; None is the avatar's own.
 
         Returns:
             Means [...,M,3], quats [...,M,4] and scales [...,M,3].
@@ -165,7 +171,7 @@ class Avatar:
         Raises:
             AvatarError: the head model is another one.
         """
-        if skinning == "released":
+        if (skinning or self.skinning) == "released":
             own = params.replace(identity=self.identity)
             means = skin_points(self.means, head, own, Binding(0, self.triangle, self.triangle, self.barycentric))
             lead = means.shape[:-2]
@@ -177,10 +183,10 @@ class Avatar:
         )
 
 
-_TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance"))
+_TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance", "skinning"))
 
 
-def _read(path: Path) -> tuple[str, dict[str, str], dict[str, Tensor]]:
+def _read(path: Path) -> dict[str, Any]:
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -202,7 +208,12 @@ def _read(path: Path) -> tuple[str, dict[str, str], dict[str, Tensor]]:
             if not isinstance(provenance, dict):
                 raise AvatarError(f"{path}: has an unreadable provenance entry; make the avatar again")
             tensors = {name: file.get_tensor(name) for name in _TENSORS}
-            return metadata["head_id"], {str(key): str(value) for key, value in provenance.items()}, tensors
+            return {
+                "head_id": metadata["head_id"],
+                "provenance": {str(key): str(value) for key, value in provenance.items()},
+                "skinning": metadata.get("skinning", "surface"),
+                **tensors,
+            }
     except SafetensorError as error:
         raise AvatarError(f"{path}: is truncated, damaged or not an avatar file ({error})") from error
     except AvatarError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,16 @@ from uika.motion import Motion
 
 if TYPE_CHECKING:
     from drjit_splat.frames import Frame, ProjectedFrame
+    from uika.avatar.rig import Posed
+
+
+class PosedMesh(NamedTuple):
+    """The head in one frame."""
+
+    vertices: Tensor  # [V,3] metres
+    turn: Tensor  # [4] wxyz, the rigid turn of the mesh
+    centres: Tensor | None  # [M,3] metres of the Gaussians, of an avatar that is moved by skinning alone
+
 
 _BLOCK = 16  # frames whose meshes are posed together: one product of matrices instead of many thin ones
 
@@ -48,27 +58,34 @@ class FrameRenderer:
             avatar.barycentric,
         )
         self._head = _personal(head, avatar.identity, self.canonical)
+        self._avatar, self._own_head = avatar, head
+        self._still = (_flat(avatar.quats), _flat(avatar.scales))
         self._opacities, self._colors = _flat(avatar.opacities), _flat(avatar.colors)
         self._background = _flat(torch.tensor(list(background)))
 
-    def meshes(self, params: HeadParameters) -> tuple[Tensor, Tensor]:
-        """Vertices [T,V,3] in metres and rigid turns [T,4] of T frames; the identity in `params` is ignored."""
-        own = params.replace(identity=params.expression[..., :0])
-        with torch.no_grad():
-            vertices = pose_vertices(self._head, own)
-            return vertices, rigid_turn(self.canonical, vertices)
+    @torch.no_grad()
+    def meshes(self, params: HeadParameters) -> list[PosedMesh]:
+        """The head in T frames; the identity in `params` is ignored."""
+        vertices = pose_vertices(self._head, params.replace(identity=params.expression[..., :0]))
+        turns = rigid_turn(self.canonical, vertices)
+        centres: Sequence[Tensor | None] = [None] * len(vertices)
+        if self._avatar.skinning == "released":
+            centres = self._avatar.pose(params, self._own_head)[0].unbind()
+        return [PosedMesh(*parts) for parts in zip(vertices, turns, centres, strict=True)]
 
-    def project(self, vertices: Tensor, turn: Tensor, camera: Camera) -> ProjectedFrame:
-        """Begin with one frame: queue its Gaussians and their projection; nothing is waited for.
+    def gaussians(self, mesh: PosedMesh) -> Posed:
+        """The Gaussians of one of `meshes`; the work is queued, not waited for."""
+        from uika.avatar.rig import Posed
 
-        Args:
-            vertices: [V,3] one of `meshes`.
-            turn: [4] its rigid turn.
-            camera: one camera.
-        """
+        if mesh.centres is None:
+            return self.rig.pose(mesh.vertices, mesh.turn)
+        return Posed(_flat(mesh.centres), *self._still)
+
+    def project(self, mesh: PosedMesh, camera: Camera) -> ProjectedFrame:
+        """Begin with one frame: queue its Gaussians and their projection; nothing is waited for."""
         from drjit_splat.frames import project_frame
 
-        posed = self.rig.pose(vertices, turn)
+        posed = self.gaussians(mesh)
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
         return project_frame(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
 
@@ -116,8 +133,8 @@ def film(
     for index in counted(range(len(motion)), progress, len(motion), "frames"):
         place = index % _BLOCK
         if place == 0:
-            vertices, turns = renderer.meshes(params[index : index + _BLOCK])
-        projected = renderer.project(vertices[place], turns[place], path[index])
+            meshes = renderer.meshes(params[index : index + _BLOCK])
+        projected = renderer.project(meshes[place], path[index])
         done = None if frame is None else frame.numpy()
         frame = renderer.blend(projected, frame)
         if done is not None:

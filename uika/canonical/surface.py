@@ -95,6 +95,25 @@ def surface_texels(
     return replace(surface, lift=lift, shape=shape, face=face), binding
 
 
+def template_texels(head: HeadModel, size: int) -> tuple[SurfaceTexels, Binding]:
+    """Points on the mean head at every texel strictly inside the atlas, where the paper's Gaussians start.
+
+    Rotations and sizes are absolute in a model on the template and ask nothing of the surface.
+
+    Returns:
+        The surface with batch dimension 1, and the binding of its M texels.
+    """
+    binding = uv_texels(head, size, "released")
+    points = surface_points(head.template, head.faces, binding)
+    upright = torch.eye(4)[:1].expand(len(points), -1)
+    return SurfaceTexels(points[None], upright[None], torch.ones_like(points)[None]), binding
+
+
+def canonical_binding(head: HeadModel, canonical: str, size: int) -> Binding:
+    """The texels of a model with this `ModelConfig.canonical`."""
+    return uv_texels(head, size, "released" if canonical == "template" else "watertight")
+
+
 def _at_seam(binding: Binding) -> Tensor:
     """Which of the M texels have a neighbour outside the atlas."""
     outside = (~binding.valid).float()[None, None]

@@ -11,6 +11,7 @@ from uika.cli.export import Export
 from uika.cli.head import Head
 from uika.cli.reconstruct import Reconstruct
 from uika.cli.render import Render
+from uika.cli.study import Study
 from uika.cli.synthesize import Synthesize
 from uika.cli.track import Track
 from uika.cli.train import Train
@@ -31,6 +32,7 @@ Command = (
     | Train
     | Synthesize
     | Evaluate
+    | Study
     | Weights
     | Bench
     | Doctor

@@ -41,6 +41,7 @@ def contact_sheet(cells: Sequence[tuple[str, Tensor]], columns: int, cell: int =
 def reconstruction_sheet(result: Reconstruction, head: HeadModel, cell: int = 256) -> Tensor:
     """The first photo, the avatar from the photo's camera, from four sides and with four expressions; [H,W,3]."""
     avatar = result.avatar
+    assert result.fit is not None  # of the built-in network, which needs one
     canonical = avatar.canonical_vertices(head)
     rest = HeadParameters.zeros(head)
 

@@ -29,7 +29,11 @@ class Evaluate:
     views: str = "1,2,4,8,16"
     """Numbers of source frames, with commas."""
     model: str = "tiny"
-    """tiny, none, or a trained model file."""
+    """tiny, none, or a trained or released model file."""
+    estimator: Annotated[Path | None, arg(metavar="PATH")] = None
+    """Correspondence estimator for the sources."""
+    backbone: Annotated[Path | None, arg(metavar="PATH")] = None
+    """DINOv3 weights for a model without."""
     name: str = ""
     """The method's name in the tables; the model's or folder's name if left out."""
     correspondence: Literal["fit", "exact"] = "fit"
@@ -57,7 +61,7 @@ class Evaluate:
             from uika.avatar.rendering import check_renderer
             from uika.reconstruction import check_model
 
-            check_model(self.model)
+            check_model(self.model, self.estimator, self.backbone)
             check_renderer()
         given = {field.name: getattr(self, field.name) for field in fields(Evaluation)} | {"views": counts}
         settings = ("mono", "multi") if self.setting == "both" else (self.setting,)

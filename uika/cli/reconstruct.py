@@ -25,7 +25,11 @@ class Reconstruct:
     output: Annotated[Path, arg(aliases=["-o"])] = Path("avatar.safetensors")
     """The avatar file to write."""
     model: str = "tiny"
-    """tiny, none, or a trained model file."""
+    """tiny, none, or a trained or released model file."""
+    estimator: Path | None = None
+    """A correspondence estimator in the place of the fitted head or the model's own."""
+    backbone: Path | None = None
+    """DINOv3 weights for released weights without their own."""
     refine: bool = True
     """Refine face shape and poses with the colours that two or more photos share."""
     keep: Literal["all", "foreground"] = "all"
@@ -37,13 +41,21 @@ class Reconstruct:
         """Reconstruct and save."""
         target = check_output(self.output, ".safetensors")
         _check_photos(self.photos)
-        from uika.reconstruction import reconstruct
+        from uika.reconstruction import check_model, reconstruct
         from uika.safeguards import stamped
 
-        result = reconstruct(self.photos, model=self.model, refine=self.refine, keep=self.keep)
+        check_model(self.model, self.estimator, self.backbone)
+        result = reconstruct(
+            self.photos,
+            model=self.model,
+            estimator=self.estimator,
+            backbone=self.backbone,
+            refine=self.refine,
+            keep=self.keep,
+        )
         stamped(result.avatar, consent=self.consent).save(target)
         print_seconds(result.report)
-        if result.fit.gain:
+        if result.fit is not None and result.fit.gain:
             print(f"refined: {result.fit.gain}")
         print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
         return 0

@@ -27,6 +27,8 @@ class Track:
     """The motion file to write: .npz, or .csv and .json with ARKit activations."""
     preview: Path | None = None
     """A video to write that shows frames and tracked head side by side."""
+    estimator: Path | None = None
+    """A correspondence estimator that places the landmarks anew in each frame; slow."""
 
     def run(self) -> int:
         """Track and save."""
@@ -38,7 +40,12 @@ class Track:
         from uika.tracking import track_video, write_preview
 
         head = load_head()
-        found = track_video(self.video, head, progress=True)
+        place = None
+        if self.estimator is not None:
+            from uika.reconstruction.estimated_landmarks import EstimatedLandmarks
+
+            place = EstimatedLandmarks(self.estimator, head)
+        found = track_video(self.video, head, progress=True, place=place)
         if suffix == ".npz":
             save_motion(found.motion, target, head)
         else:

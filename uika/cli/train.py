@@ -24,7 +24,7 @@ class Train:
     output: Annotated[Path, arg(aliases=["-o"])]
     """The run's folder, with the model in the end."""
     data: tuple[str, ...] = ("synthetic",)
-    """Folders of captures or shards; "synthetic" makes people on the way."""
+    """Folders of captures or shards, or "synthetic" people."""
     preset: Literal["tiny", "base", "paper"] = "tiny"
     """Size of the network, and its training."""
     part: Literal["reconstructor", "estimator"] = "reconstructor"
@@ -32,7 +32,7 @@ class Train:
     steps: int | None = None
     """Steps in all."""
     resume: bool = False
-    """Go on from the newest whole checkpoint."""
+    """Go on from the newest checkpoint."""
     overfit: int = 0
     """Self-test: the same N heads at every step."""
     workers: int = 1
@@ -54,13 +54,18 @@ class Train:
     save_every: int | None = None
     """Steps from one checkpoint to the next."""
     init: Path | None = None
-    """A trained model of the same architecture to start from."""
+    """A model of the same architecture to start from."""
     lpips: Path | None = None
-    """LPIPS weights, else a loss on gradients."""
+    """LPIPS weights, else gradients are compared."""
+    backbone: Annotated[Path | None, arg(metavar="PATH")] = None
+    """DINOv3 weights, which base and paper need."""
+    estimator: Annotated[Path | None, arg(metavar="PATH")] = None
+    """Finds the photos' UVs, else the data tells."""
 
     def run(self) -> int:
         """Train."""
         check_folder(self.output)
+        from uika.model.weight_kind import ESTIMATORS, check_kind
         from uika.train import MODEL_FILE, SYNTHETIC, TRAINING, Setup, Stored, Synthetic, join_group, leave_group, train
         from uika.train.logbook import read_log
 
@@ -77,6 +82,7 @@ class Train:
             # The same pictures at every step, which alone count, and full speed soon: this shows that gradients arrive.
             losses = replace(config.losses, atlas=0.0, relief=0.0)
             config = replace(config, augment=False, fitted=0.0, losses=losses, ema=0.0, weight_decay=0.0)
+            config = replace(config, backgrounds=(1.0,))
             config = replace(config, warmup=min(20, config.warmup))
         if "steps" in given:
             config = replace(config, warmup=min(config.warmup, max(1, config.steps // 10)))
@@ -91,9 +97,23 @@ class Train:
             people = Synthetic(self.output / "people", self.people, size=config.size, seed=self.seed)
         else:
             people = Stored([Path(name) for name in self.data])
+        if self.estimator is not None:
+            if self.part == "estimator":
+                raise UikaError("--estimator helps to train the reconstructor; --init starts an estimator from another")
+            check_kind(self.estimator, ESTIMATORS)
         group = join_group(self.device)
         try:
-            setup = Setup(self.output, self.workers, self.resume, self.overfit, self.sharding, self.lpips, self.init)
+            setup = Setup(
+                self.output,
+                self.workers,
+                self.resume,
+                self.overfit,
+                self.sharding,
+                lpips=self.lpips,
+                init=self.init,
+                backbone=self.backbone,
+                estimator=self.estimator,
+            )
             train(config, people, setup, group)
         finally:
             leave_group()

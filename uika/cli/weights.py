@@ -24,5 +24,6 @@ class Weights:
         for status in found:
             file = status.file
             print(f"\n{file.name}  {status.state}  {file.gigabytes:g} GB")
-            print(f"  for      {file.purpose}\n  licence  {file.licence}\n  from     {file.source}")
+            lines = {"for": file.purpose, "unlocks": file.command, "licence": file.licence, "from": file.source}
+            print("\n".join(f"  {name:<8} {text}" for name, text in lines.items()))
         return int(any(status.state == "damaged" for status in found))

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-import tarfile
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
-from uika.data import DataError, Sample, open_capture
-from uika.data.capture import DESCRIPTION, parse_frame
+from uika.data import Capture, DataError, Sample, open_capture
+from uika.data.capture import DESCRIPTION, is_capture, parse_frame
 from uika.data.decoding import build_sample, read_arrays
-from uika.data.shards import EXTENSIONS
+from uika.data.shard_index import open_index
+from uika.data.shards import PICTURES, picture_files
 from uika.errors import UikaError
 
 SYNTHETIC = "synthetic"
+_CANONICAL = "canonical.npz"
 _OPEN = 64  # captures and shards whose descriptions stay in memory
 
 
@@ -43,28 +44,23 @@ class Shard:
     """A tar file in webdataset layout, read at random through an index of its entries."""
 
     def __init__(self, path: Path) -> None:
-        """Index the file.
+        """Open the file's index.
 
         Raises:
             DataError: it is not a shard or holds no image.
         """
         self._path = path
-        self._place: dict[str, tuple[int, int]] = {}
-        try:
-            with tarfile.open(path, "r:") as archive:
-                for info in archive:
-                    self._place[info.name] = (info.offset_data, info.size)
-        except (OSError, tarfile.TarError) as error:
-            raise DataError(f"{path}: is not a readable shard ({error})") from error
-        self._keys = sorted({name.partition(".")[0] for name in self._place if name.endswith(".png")})
-        if not self._keys:
+        self._index = open_index(path)
+        self._rows = self._index.rows_with(PICTURES)
+        if not self._rows:
             raise DataError(f"{path}: holds no images")
-        shared = next((name for name in self._place if name.endswith(".canonical.npz")), None)
-        self._canonical = {} if shared is None else read_arrays(self._read(shared), f"{path}/{shared}")
+        shared = self._index.rows_with((_CANONICAL,))
+        name = f"{path}/{self._index.keys[shared[0]]}.{_CANONICAL}" if shared else ""
+        self._canonical = read_arrays(self._read(shared[0], _CANONICAL), name) if shared else {}
 
     def __len__(self) -> int:
         """The number of images."""
-        return len(self._keys)
+        return len(self._rows)
 
     def sample(self, index: int) -> Sample:
         """Read one image.
@@ -72,25 +68,40 @@ class Shard:
         Raises:
             DataError: an entry cannot be used; the message names it.
         """
-        key = self._keys[index]
-        names = {kind: f"{key}.{extension}" for kind, extension in EXTENSIONS.items()}
-        names = {kind: name for kind, name in names.items() if name in self._place}
+        row = self._rows[index]
+        key = self._index.keys[row]
+        names = picture_files(key, self._extensions(row))
         try:
-            entry = json.loads(self._read(f"{key}.json"))
+            entry = json.loads(self._read(row, "json"))
         except (KeyError, ValueError) as error:
             raise DataError(f"{self._path}/{key}.json: is missing or not complete JSON") from error
-        contents = {kind: self._read(name) for kind, name in names.items()}
+        contents = {kind: self._read(row, name.partition(".")[2]) for kind, name in names.items()}
         frame = parse_frame(entry, names, f"{self._path}/{key}.json", 0)
         return build_sample(frame, contents, self._canonical, str(self._path), key.partition("_")[0])
 
-    def _read(self, name: str) -> bytes:
-        offset, size = self._place[name]
+    def _extensions(self, row: int) -> set[str]:
+        return {name for name in self._index.extensions if self._index.place(row, name)}
+
+    def _read(self, row: int, extension: str) -> bytes:
+        place = self._index.place(row, extension)
+        if place is None:
+            raise KeyError(extension)
+        offset, size = place
         with self._path.open("rb") as file:
             file.seek(offset)
             data = file.read(size)
         if len(data) != size:
             raise DataError(f"{self._path}: is truncated; make it again")
         return data
+
+
+def left_out(person: Person) -> tuple[str, ...]:
+    """Sentences on what of a person's files is not used."""
+    if not isinstance(person, Capture):
+        return ()
+    count = len(person.skipped)
+    frames = f"{person.folder}: {count} of {count + len(person)} frames are left out; the first: "
+    return (*person.notes, *((frames + person.skipped[0],) if count else ()))
 
 
 @lru_cache(maxsize=_OPEN)
@@ -171,7 +182,7 @@ def find_people(folder: Path) -> list[Path]:
     Raises:
         UikaError: there are none.
     """
-    if (folder / DESCRIPTION).is_file():
+    if is_capture(folder):
         return [folder]
     if not folder.is_dir():
         raise UikaError(f"{folder}: no such folder; give folders with captures or shards, or '{SYNTHETIC}'")

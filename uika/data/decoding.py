@@ -16,6 +16,9 @@ from uika.errors import UikaError
 from uika.head import Camera, HeadParameters
 from uika.io.npz import ArraysError, read_npz
 
+FLAME_VERTICES, TRACKED_VERTICES = 5023, 5143  # VHAP's FLAME has rows of teeth behind the vertices of the model
+# What all frames of a capture may share. The file that says so also holds a pose, which is that of no frame.
+SHARED = ("shape", "static_offset")
 _POSE = {"rotation": ("rotation", 3), "neck": ("neck_pose", 3), "jaw": ("jaw_pose", 3), "eyes": ("eyes_pose", 6)}
 
 
@@ -38,7 +41,7 @@ def build_sample(
     Args:
         frame: the frame.
         contents: description key (`file_path`, ...) -> bytes of the file.
-        canonical: arrays that all frames share.
+        canonical: arrays that all frames share; of these, `SHARED` are read.
         where: the folder or shard, for messages.
         identity: name of the person's capture.
 
@@ -67,14 +70,13 @@ def build_sample(
     except UikaError as error:
         raise DataError(str(error)) from error
     parameters = None
-    arrays: dict[str, np.ndarray] = dict(canonical)
+    shared = shared_arrays(canonical, where)[0]
     if "flame_param_path" in contents:
-        own = read_arrays(contents["flame_param_path"], names["flame_param_path"])
-        parameters = _parameters({**own, **canonical}, names["flame_param_path"])
-        arrays = {**own, **arrays}
-    offset = arrays.get("static_offset")
-    if offset is not None and offset.size % 3:
-        raise DataError(f"{where}: array 'static_offset' has the shape {offset.shape}, not [V,3]")
+        name = names["flame_param_path"]
+        own = read_arrays(contents["flame_param_path"], name)
+        shared = shared_arrays(own, name)[0] | shared
+        parameters = _parameters(own | shared, name)
+    offset = shared.get("static_offset")
     return Sample(
         key=f"{identity}_{frame.timestep:05d}_{frame.camera_id}",
         identity=identity.partition("_")[0],
@@ -84,9 +86,33 @@ def build_sample(
         mask=torch.from_numpy(mask).float() / 255,
         camera=_camera(frame, size[0], size[1], where),
         parameters=parameters,
-        static_offset=None if offset is None else torch.from_numpy(offset.astype(np.float32)).reshape(-1, 3),
+        static_offset=None if offset is None else torch.from_numpy(offset),
         **labels,
     )
+
+
+def shared_arrays(arrays: Mapping[str, np.ndarray], name: str) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The arrays `SHARED` of a parameter file, float32, and sentences on what was left out of them.
+
+    An offset of VHAP's FLAME loses its teeth, which lie behind the 5,023 vertices that every FLAME model has.
+
+    Raises:
+        DataError: the offset has another shape than [V,3]; the message says `name`.
+    """
+    found = {key: arrays[key].astype(np.float32) for key in SHARED if key in arrays}
+    notes = []
+    if (offset := found.get("static_offset")) is not None:
+        if offset.size % 3 or offset.shape[-1] != 3:
+            raise DataError(f"{name}: array 'static_offset' has the shape {offset.shape}, not [V,3]")
+        offset = offset.reshape(-1, 3)
+        if len(offset) == TRACKED_VERTICES:
+            offset = offset[:FLAME_VERTICES]
+            notes.append(
+                f"{name}: 'static_offset' has {TRACKED_VERTICES:,} vertices; the {TRACKED_VERTICES - FLAME_VERTICES} "
+                "of the teeth are left out"
+            )
+        found["static_offset"] = offset
+    return found, notes
 
 
 def read_arrays(data: bytes, name: str) -> dict[str, np.ndarray]:

@@ -7,12 +7,13 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
-from uika.data.encode import DEPTH_UNIT, UV_STEPS, encode_pixels, encode_uv
+from uika.data.encode import DEPTH_UNIT, UV_STEPS, encode_jpeg, encode_pixels, encode_uv
 from uika.data.performance import perform, place_camera, viewpoints
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, shaped_vertices, vertex_normals
 
@@ -22,18 +23,56 @@ if TYPE_CHECKING:
 _SPP = 4
 _LIGHT_SAMPLES = (32, 64)  # for each vertex, in images below and from 256 pixels on
 _ENCODERS = 2
-_WAITING = 9  # views that may wait for an encoder
+_WAITING = 1  # moments that may wait for their encoders beside the one at hand
 # One stream of random numbers for each purpose, so that none depends on how often another was asked.
 _STREAMS = {"person": 0, "motion": 1, "light": 2, "camera": 3, "backdrop": 4, "samples": 5}
 
 
+class FrameFiles(NamedTuple):
+    """One moment of a performance."""
+
+    flame: tuple[str, bytes]  # path inside the capture, content
+    views: list[tuple[dict[str, Any], dict[str, bytes]]]  # entry of the description; its key -> content of that file
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is kept of a person."""
+
+    views: int
+    frames: int
+    size: int  # pixels
+    labels: Literal["full", "tracked"] = "full"  # tracked: none, the head's parameters say what each pixel shows
+    images: Literal["png", "jpeg"] = "png"
+
+
 def generate_identity(
-    head: HeadModel, seed: int, identity: int, views: int, frames: int, size: int
+    head: HeadModel, seed: int, identity: int, views: int, frames: int, size: int, **kept: Any
 ) -> Iterator[tuple[str, bytes]]:
     """Files of the capture of one person as (path inside its folder, content), in a fixed order.
 
     All depends on the arguments alone. The folder holds `transforms.json` and parameter files as VHAP exports them, and
-    beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`).
+    beside `images/` and `fg_masks/` the exact labels `uv/` and `depth/` (see `uika.data.encode`); `kept` are fields of
+    `Recording`.
+    """
+    shared, moments = record_identity(head, seed, identity, Recording(views, frames, size, **kept))
+    canonical = shared.pop("canonical")
+    yield "canonical_flame_param.npz", canonical
+    entries = []
+    for moment in moments:
+        yield moment.flame
+        for entry, files in moment.views:
+            entries.append(entry)
+            yield from ((entry[kind], data) for kind, data in files.items())
+    yield "transforms.json", json.dumps({**shared, "frames": entries}, indent=1).encode()
+
+
+def record_identity(
+    head: HeadModel, seed: int, identity: int, recording: Recording, start: int = 0
+) -> tuple[dict[str, Any], Iterator[FrameFiles]]:
+    """What all moments of one person share (its canonical parameters as `canonical`), and the moments from `start` on.
+
+    No moment depends on those before it, so that a recording can be taken up at any of them.
     """
     from scenes.people import paint, sample_person, wear_glasses
     from scenes.people.hair import hair_offsets
@@ -41,6 +80,7 @@ def generate_identity(
     from scenes.synthesis.lighting import backdrop, sample_lighting
     from scenes.synthesis.vertex_light import lit_scene
 
+    views, frames, size = recording.views, recording.frames, recording.size
     person = sample_person(int(_random(seed, identity, "person").integers(2**31)), head)
     lighting = sample_lighting(_random(seed, identity, "light"))
     head_scene = lit_scene(head, lighting.light)
@@ -60,37 +100,45 @@ def generate_identity(
         (255 * backdrop(_random(seed, identity, "backdrop", index), size) + 0.5).astype(np.uint8)
         for index in range(views)
     ]
-    yield "canonical_flame_param.npz", _npz(shape=person.shape[None], static_offset=offset[None])
-    posed = pose_vertices(head, params, offset)
-    with ThreadPoolExecutor(_ENCODERS) as pool:
-        waiting: deque[Future[list[tuple[str, bytes]]]] = deque()
-        for frame in range(frames):
-            yield f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))
-            glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape) if person.glasses else None
-            shader = Shader(
-                head_scene,
-                head,
-                posed[frame],
-                texture,
-                glasses,
-                exposure=exposure,
-                samples=_LIGHT_SAMPLES[size >= 256],
-                seed=samples,
-            )
-            seen = shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT, _SPP)
-            for view, images in enumerate(seen):
-                waiting.append(pool.submit(_encode, f"{frame:05d}_{view:02d}.png", images))
-                while len(waiting) > max(views, _WAITING):
-                    yield from waiting.popleft().result()
-        while waiting:
-            yield from waiting.popleft().result()
-    description = {
+
+    def moments() -> Iterator[FrameFiles]:
+        waiting: deque[tuple[int, list[Future[dict[str, bytes]]]]] = deque()
+        with ThreadPoolExecutor(_ENCODERS) as pool:
+            for frame in range(start, frames):
+                posed = pose_vertices(head, params[frame], offset)
+                glasses = None
+                if person.glasses:
+                    glasses = wear_glasses(person.glasses, head, params[frame], bare, person.shape)
+                shader = Shader(
+                    head_scene,
+                    head,
+                    posed,
+                    texture,
+                    glasses,
+                    exposure=exposure,
+                    samples=_LIGHT_SAMPLES[size >= 256],
+                    seed=samples,
+                )
+                seen = shader.stored_views(cameras, backdrops, UV_STEPS, DEPTH_UNIT, _SPP)
+                waiting.append((frame, [pool.submit(_encode, images, recording) for images in seen]))
+                if len(waiting) > _WAITING:
+                    yield finished(*waiting.popleft())
+            while waiting:
+                yield finished(*waiting.popleft())
+
+    def finished(frame: int, encoded: list[Future[dict[str, bytes]]]) -> FrameFiles:
+        pairs = []
+        for view, (camera, files) in enumerate(zip(cameras, encoded, strict=True)):
+            pairs.append((_entry(frame, view, camera, recording), files.result()))
+        return FrameFiles((f"flame_param/{frame:05d}.npz", _npz(**_flame(params[frame]))), pairs)
+
+    shared = {
+        "canonical": _npz(shape=person.shape[None], static_offset=offset[None]),
         "head_id": head.id,
         "person": {"cut": person.cut, "beard": person.beard, "glasses": person.glasses is not None},
         "light": lighting.light,
-        "frames": [_entry(frame, view, camera) for frame in range(frames) for view, camera in enumerate(cameras)],
     }
-    yield "transforms.json", json.dumps(description, indent=1).encode()
+    return shared, moments()
 
 
 def texture_size(size: int) -> int:
@@ -98,13 +146,12 @@ def texture_size(size: int) -> int:
     return min(max(256, 3 * size // 2), 1024)
 
 
-def _encode(name: str, images: StoredView) -> list[tuple[str, bytes]]:
-    return [
-        (f"images/{name}", encode_pixels(images.rgb)),
-        (f"fg_masks/{name}", encode_pixels(images.mask)),
-        (f"uv/{name}", encode_uv(images.uv)),
-        (f"depth/{name}", encode_pixels(images.depth)),
-    ]
+def _encode(images: StoredView, recording: Recording) -> dict[str, bytes]:
+    colour = encode_jpeg(images.rgb) if recording.images == "jpeg" else encode_pixels(images.rgb)
+    files = {"file_path": colour, "fg_mask_path": encode_pixels(images.mask)}
+    if recording.labels == "full":
+        files |= {"uv_path": encode_uv(images.uv), "depth_path": encode_pixels(images.depth)}
+    return files
 
 
 def _random(seed: int, identity: int, stream: str, index: int = 0) -> np.random.Generator:
@@ -142,12 +189,12 @@ def _npz(**tensors: torch.Tensor) -> bytes:
     return buffer.getvalue()
 
 
-def _entry(frame: int, view: int, camera: Camera) -> dict[str, Any]:
+def _entry(frame: int, view: int, camera: Camera, recording: Recording) -> dict[str, Any]:
     to_world = torch.linalg.inv(camera.viewmat.double())
     to_world[:3, 1:3] *= -1  # OpenGL axes
-    name = f"{frame:05d}_{view:02d}.png"
+    name = f"{frame:05d}_{view:02d}"
     K = camera.K.double()
-    return {
+    entry = {
         "timestep_index": frame,
         "camera_index": view,
         "camera_id": f"{view:02d}",
@@ -158,9 +205,10 @@ def _entry(frame: int, view: int, camera: Camera) -> dict[str, Any]:
         "w": camera.width,
         "h": camera.height,
         "transform_matrix": to_world.tolist(),
-        "file_path": f"images/{name}",
-        "fg_mask_path": f"fg_masks/{name}",
+        "file_path": f"images/{name}.{'jpg' if recording.images == 'jpeg' else 'png'}",
+        "fg_mask_path": f"fg_masks/{name}.png",
         "flame_param_path": f"flame_param/{frame:05d}.npz",
-        "uv_path": f"uv/{name}",
-        "depth_path": f"depth/{name}",
     }
+    if recording.labels == "full":
+        entry |= {"uv_path": f"uv/{name}.png", "depth_path": f"depth/{name}.png"}
+    return entry

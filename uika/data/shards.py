@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from uika.data.decoding import build_sample, read_arrays
 from uika.data.sample import DataError, Sample
 from uika.io.files import replacing
 
-# Key of a frame's description -> extension of its file in a shard.
+# Key of a frame's description -> extension of its file in a shard; pictures may have others, see `PICTURES`.
 EXTENSIONS = {
     "file_path": "png",
     "fg_mask_path": "mask.png",
@@ -23,6 +24,32 @@ EXTENSIONS = {
     "depth_path": "depth.png",
     "flame_param_path": "flame.npz",
 }
+PICTURES = ("png", "jpg")
+
+
+def shard_entries(name: str, entry: dict[str, Any], files: Mapping[str, bytes]) -> Iterator[tuple[str, bytes]]:
+    """Entries of one image of a person `name`: its files, the description last.
+
+    Args:
+        name: of the person.
+        entry: the image's description.
+        files: key of the description -> content of the file that it names.
+    """
+    key = f"{name}_{entry['timestep_index']:05d}_{entry['camera_id']}"
+    for kind, extension in EXTENSIONS.items():
+        if kind in files:
+            own = entry[kind].rpartition(".")[2] if kind == "file_path" else extension
+            yield f"{key}.{own}", files[kind]
+    yield f"{key}.json", json.dumps(entry).encode()
+
+
+def picture_files(key: str, extensions: Collection[str]) -> dict[str, str]:
+    """Key of a description -> name of the entry, for the extensions that a group of a shard has; empty: no image."""
+    picture = next((extension for extension in PICTURES if extension in extensions), None)
+    if picture is None:
+        return {}
+    own = EXTENSIONS | {"file_path": picture}
+    return {kind: f"{key}.{extension}" for kind, extension in own.items() if extension in extensions}
 
 
 def write_shard(path: str | Path, entries: Iterable[tuple[str, bytes]]) -> None:
@@ -69,7 +96,7 @@ def read_shard(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
 
 
 def shard_samples(path: str | Path, strict: bool = False) -> Iterator[Sample]:
-    """The samples of a shard that `uika.data.synthesize` wrote; bad ones are left out unless `strict`.
+    """The samples of a shard that `uika.data.synthesis` wrote; bad ones are left out unless `strict`.
 
     Raises:
         DataError: the shard is damaged, or, with `strict`, one of its samples.
@@ -92,8 +119,8 @@ def _sample(key: str, group: dict[str, bytes], canonical: dict[str, np.ndarray],
         entry = json.loads(group["json"])
     except (KeyError, ValueError, RecursionError) as error:
         raise DataError(f"{name}: is missing or not complete JSON") from error
-    if not isinstance(entry, dict) or "png" not in group:
+    files = picture_files(key, group)
+    if not isinstance(entry, dict) or not files:
         raise DataError(f"{where}/{key}: lacks its image or description")
-    contents = {kind: group[extension] for kind, extension in EXTENSIONS.items() if extension in group}
-    files = {kind: f"{key}.{EXTENSIONS[kind]}" for kind in contents}
+    contents = {kind: group[file.partition(".")[2]] for kind, file in files.items()}
     return build_sample(parse_frame(entry, files, name, 0), contents, canonical, where, key.partition("_")[0])

@@ -8,16 +8,22 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from uika.data.identity import generate_identity
-from uika.data.shards import EXTENSIONS, write_shard
+from uika.data.identity import Recording, record_identity
+from uika.data.shard_index import open_index, write_index
+from uika.data.shard_writer import ShardWriter
+from uika.data.shards import EXTENSIONS, shard_entries, write_shard
 from uika.errors import UikaError, install_command
 from uika.head import HeadModel, load_head
 from uika.io.files import check_folder, replacing
 
 SETTINGS_FILE = "synthesis.json"
-_LIMITS = {"identities": 1_000_000, "views": 64, "frames": 1000, "size": 2048}
+CANONICAL = "canonical_flame_param.npz"
+_NOTES = ".frames"  # folder of an unfinished capture
+_USUAL = {"labels": "full", "images": "png"}  # not written down
+_LIMITS = {"identities": 1_000_000, "views": 64, "frames": 100_000, "size": 2048}
+_HEADER = 2  # entries of a shard before those of its images
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,15 @@ class Synthesis:
     size: int = 512
     seed: int = 0
     shard: str = "0/1"  # "i/n": this run makes the identities i, i + n, i + 2n, ...
-    archives: bool = True  # whether to write webdataset shards beside the folders
+    captures: bool = True  # whether to write a folder of loose files for each person
+    archives: bool = True  # whether to write a webdataset shard for each person
+    labels: Literal["full", "tracked"] = "full"  # tracked: no correspondences and depths, the parameters tell them
+    images: Literal["png", "jpeg"] = "png"
+
+    @property
+    def recording(self) -> Recording:
+        """What is kept of each person."""
+        return Recording(self.views, self.frames, self.size, self.labels, self.images)
 
     def part(self) -> tuple[int, int]:
         """The i and n of `shard`.
@@ -58,8 +72,8 @@ def synthesize(settings: Synthesis, head: HeadModel | None = None, progress: boo
     """Make the people of one shard that are not complete yet.
 
     `output/captures/000012/` holds a person as a capture (`uika.data.open_capture` reads it) and
-    `output/shards/000012.tar` the same files as a webdataset shard. A person appears under its name only when complete,
-    so a run that was killed can be started again.
+    `output/shards/000012.tar` the same files as a webdataset shard, with its index beside it. A person appears under
+    its name only when complete; a run that was killed is started again and goes on with the moment that it was at.
 
     Raises:
         UikaError: a value is out of range, the folder holds a set made with other values, or the disk is full.
@@ -70,6 +84,8 @@ def synthesize(settings: Synthesis, head: HeadModel | None = None, progress: boo
             raise UikaError(f"{name} must lie between 1 and {most}, not {getattr(settings, name)}")
     if settings.seed < 0 or settings.size < 16:
         raise UikaError("seed must not be negative and size at least 16 pixels")
+    if not (settings.captures or settings.archives):
+        raise UikaError("captures and archives are both off; nothing would be kept")
     model = load_head() if head is None else head
     root = check_folder(settings.output)
     wanted = range(part, settings.identities, parts)
@@ -93,43 +109,100 @@ def identity_name(identity: int) -> str:
 
 def _make(root: Path, identity: int, settings: Synthesis, head: HeadModel, bar: _Bar) -> None:
     name = identity_name(identity)
+    shard = root / "shards" / f"{name}.tar"
+    if not settings.captures:
+        _record(shard, identity, settings, head, bar)
+        return
     folder = root / "captures" / name
     if not folder.exists():
         partial = folder.with_name(f".{name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        files = generate_identity(head, settings.seed, identity, settings.views, settings.frames, settings.size)
-        for path, content in files:
-            target = partial / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(content)
-            bar.add(path.startswith("images/"))
+        start = _complete_moments(partial, settings)
+        bar.skip(start * settings.views)
+        shared, moments = record_identity(head, settings.seed, identity, settings.recording, start)
+        _write(partial / CANONICAL, shared.pop("canonical"))
+        for moment in moments:
+            _write(partial / moment.flame[0], moment.flame[1])
+            for entry, files in moment.views:
+                for kind, content in files.items():
+                    _write(partial / entry[kind], content)
+                _write(_note(partial, entry["timestep_index"], entry["camera_index"]), json.dumps(entry).encode())
+                bar.add(1)
+        entries = [json.loads(note.read_text()) for note in sorted((partial / _NOTES).iterdir())]
+        shutil.rmtree(partial / _NOTES)
+        _write(partial / "transforms.json", json.dumps({**shared, "frames": entries}, indent=1).encode())
         partial.replace(folder)
     if settings.archives:
-        write_shard(root / "shards" / f"{name}.tar", _entries(folder, name))
+        write_shard(shard, _entries(folder, name))
+        write_index(shard, open_index(shard))
+
+
+def _record(shard: Path, identity: int, settings: Synthesis, head: HeadModel, bar: _Bar) -> None:
+    """Write a person's shard as it is rendered."""
+    name = identity_name(identity)
+    with ShardWriter(shard, "json") as writer:
+        images = {name.partition(".")[0] for name, _, _ in writer.entries[_HEADER:]}
+        size = (len(writer.entries) - _HEADER) // max(1, len(images))  # entries of an image
+        start = len(images) // settings.views
+        writer.keep(_HEADER + start * settings.views * size if images else 0)
+        bar.skip(start * settings.views)
+        shared, moments = record_identity(head, settings.seed, identity, settings.recording, start)
+        if not images:
+            writer.add(f"{name}.canonical.npz", shared.pop("canonical"))
+            writer.add(f"{name}.json", json.dumps(shared).encode())
+        for moment in moments:
+            for entry, files in moment.views:
+                for part in shard_entries(name, entry, {**files, "flame_param_path": moment.flame[1]}):
+                    writer.add(*part)
+                bar.add(1)
+            writer.flush()
+        writer.finish()
+
+
+def _complete_moments(partial: Path, settings: Synthesis) -> int:
+    """Moments of an unfinished capture that need not be made again: all but the last one, which may be torn."""
+    last = settings.views - 1
+    done = 0
+    while done < settings.frames and _note(partial, done, last).is_file():
+        done += 1
+    return max(0, done - 1)
+
+
+def _note(partial: Path, moment: int, view: int) -> Path:
+    """Where the description of an image waits until all are there; it is written after the image's files."""
+    return partial / _NOTES / f"{moment:06d}_{view:02d}.json"
+
+
+def _write(target: Path, content: bytes) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_bytes(content)
 
 
 def _complete(root: Path, identity: int, settings: Synthesis) -> bool:
     name = identity_name(identity)
     archived = not settings.archives or (root / "shards" / f"{name}.tar").exists()
-    return archived and (root / "captures" / name).exists()
+    return archived and (not settings.captures or (root / "captures" / name).exists())
 
 
 def _entries(folder: Path, name: str) -> Iterator[tuple[str, bytes]]:
     """Entries of the shard of one person: what all samples share first, then the samples."""
     description = json.loads((folder / "transforms.json").read_text())
     frames = description.pop("frames")
-    yield f"{name}.canonical.npz", (folder / "canonical_flame_param.npz").read_bytes()
+    yield f"{name}.canonical.npz", (folder / CANONICAL).read_bytes()
     yield f"{name}.json", json.dumps(description).encode()
-    for frame in frames:
-        key = f"{name}_{frame['timestep_index']:05d}_{frame['camera_id']}"
-        for kind, extension in EXTENSIONS.items():
-            yield f"{key}.{extension}", (folder / frame[kind]).read_bytes()
-        yield f"{key}.json", json.dumps(frame).encode()
+    for entry in frames:
+        yield from shard_entries(
+            name, entry, {kind: (folder / entry[kind]).read_bytes() for kind in EXTENSIONS if kind in entry}
+        )
 
 
 def _agree(root: Path, settings: Synthesis, head: HeadModel) -> None:
     """Write the settings of a new set, or make sure that they are those of the set in the folder."""
     own = {name: getattr(settings, name) for name in ("views", "frames", "size", "seed")} | {"head_id": head.id}
+    own |= {
+        name: value
+        for name, value in (("labels", settings.labels), ("images", settings.images))
+        if value != _USUAL[name]
+    }
     file = root / SETTINGS_FILE
     if not file.exists():
         with replacing(file) as temporary:

@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from uika.data import Sample
-from uika.head import Camera
+from uika.data.head_crop import Square, head_square
+from uika.head import Camera, HeadModel
 
 SOLID = 0.98  # mask from which a pixel shows the person alone
 _REACH = 3  # pixels that colours are continued beyond it
@@ -23,13 +24,17 @@ class View:
     `image` has no backdrop: colours at the person's edge are continued from inside, to be composited with the mask.
     """
 
-    def __init__(self, sample: Sample, size: int) -> None:
-        """Pad a sample to a square and resize it."""
-        square = _squared(sample)
+    def __init__(self, sample: Sample, size: int, head: HeadModel | None = None) -> None:
+        """Cut the head out of a sample as `head_square` says, else pad the sample to a square, and resize it."""
+        crop = None if head is None else head_square(sample, head)
+        square = _squared(sample, _whole(sample) if crop is None else crop)
         mask = square["mask"]
-        planes = functional.interpolate(
-            torch.cat((_foreground(square["image"], mask), mask[None]))[None], size=(size, size), mode="area"
-        )[0]
+        planes = torch.cat((_foreground(square["image"], mask), mask[None]))[None]
+        if crop is None:
+            planes = functional.interpolate(planes, size=(size, size), mode="area")[0]
+        else:
+            # Its side has no simple ratio to the picture's.
+            planes = functional.interpolate(planes, size=(size, size), mode="bilinear", antialias=True)[0]
         self.image, self.mask = planes[:3], planes[3]
         self.camera = square["camera"].resized(size, size)
         self.key = sample.key
@@ -64,14 +69,20 @@ class View:
         self.camera = Camera(self.camera.viewmat, K, size, size)
 
 
-def _squared(sample: Sample) -> dict[str, Any]:
-    """Image, mask, camera and `uv` (NaN where unknown) of a sample, padded around its centre."""
+def _whole(sample: Sample) -> Square:
+    """The square around the centre of a sample that holds all of it."""
     height, width = sample.mask.shape
     side = max(height, width)
-    left, top = (side - width) // 2, (side - height) // 2
-    pad = (left, side - width - left, top, side - height - top)
+    return -((side - width) // 2), -((side - height) // 2), side
+
+
+def _squared(sample: Sample, square: Square) -> dict[str, Any]:
+    """Image, mask, camera and `uv` (NaN where unknown) of a square of a sample; nobody is seen outside the sample."""
+    x0, y0, side = square
+    height, width = sample.mask.shape
+    pad = (-x0, x0 + side - width, -y0, y0 + side - height)  # negative sides are cut off
     K = sample.camera.K.clone()
-    K[:2, 2] += torch.tensor([float(left), float(top)])
+    K[:2, 2] -= torch.tensor([float(x0), float(y0)])
     result: dict[str, Any] = {
         "image": functional.pad(sample.image, pad),
         "mask": functional.pad(sample.mask, pad),

@@ -86,7 +86,8 @@ class Protocol:
             f"data {self.data}: {setting}, sources turned to the camera; {task}; "
             f"at most {self.targets} targets for each sequence",
             f"{self.method}: {self.model}; {how}",
-            f"crop: the whole frame, padded to a square, {self.size}x{self.size} pixels; "
+            "crop: the head's square where it takes less than three quarters of the frame, else the whole frame, "
+            f"padded to a square; {self.size}x{self.size} pixels; "
             f"background: grey {self.background:g} in truth and result, cut out with the truth's mask",
             "values: sRGB in [0,1], both rounded to 8 bits; masked: pixels where the truth's mask is at least 0.5",
             "AED: mean difference of activations, APD: angle in radians between head rotations, both of head fits to "

@@ -39,7 +39,7 @@ _PHOTO_SIDE = 512  # pixels of photos for networks that take any
 class Observed(NamedTuple):
     """What is known of N source frames, in the order that `avatar_from_fit` takes it."""
 
-    fit: Fit
+    fit: Fit | None  # None for a model that needs none
     images: Tensor  # [N,3,S,S] on white
     mattes: Tensor  # [N,S,S]
     digests: list[str]
@@ -71,7 +71,12 @@ class Cutouts:
 
 
 def observe_sources(
-    sources: Sequence[Sample], correspondence: str, size: int, head: HeadModel, cutouts: Cutouts | None = None
+    sources: Sequence[Sample],
+    correspondence: str,
+    size: int,
+    head: HeadModel,
+    cutouts: Cutouts | None = None,
+    loaded: LoadedModel | None = None,
 ) -> Observed:
     """Heads and cameras of source frames: by landmark fits of the pictures ("fit") or their true ones ("exact").
 
@@ -81,6 +86,7 @@ def observe_sources(
         size: pixels of a side of the photos; fits decide by themselves.
         head: the head model.
         cutouts: what was prepared before.
+        loaded: the model that they are for.
 
     Raises:
         PhotoError: a source shows no face that can be found.
@@ -88,11 +94,11 @@ def observe_sources(
     """
     if correspondence == "fit":
         cutouts = cutouts or Cutouts()
-        found = fit_prepared([cutouts.photo(sample) for sample in sources], head)
+        found = fit_prepared([cutouts.photo(sample) for sample in sources], head, loaded=loaded)
         return Observed(found.fit, found.images, found.mattes, found.digests)
     for sample in sources:
         check_sample(sample, head)
-    views = [View(sample, size) for sample in sources]
+    views = [View(sample, size, head) for sample in sources]
     parameters = HeadParameters.stack([_parameters(view) for view in views])
     fit = Fit(parameters, Camera.stack([v.camera for v in views]), _offset(views[0], head), torch.zeros(len(views)))
     images = torch.stack([view.over(torch.ones(3)) for view in views])
@@ -108,7 +114,10 @@ def make_avatar(
 ) -> Avatar:
     """Reconstruct from source frames; raises as `observe_sources` does."""
     size = loaded.network.config.image_size or _PHOTO_SIDE
-    return avatar_from_fit(loaded, head, *observe_sources(sources, correspondence, size, head, cutouts), Report())
+    if correspondence == "exact":
+        loaded = loaded._replace(estimator=None)
+    observed = observe_sources(sources, correspondence, size, head, cutouts, loaded)
+    return avatar_from_fit(loaded, head, *observed, Report())
 
 
 def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: float) -> list[Tensor]:
@@ -118,8 +127,11 @@ def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: 
     for view in targets:
         params = _parameters(view).replace(identity=avatar.identity)
         truth = pose_vertices(head, _parameters(view), _offset(view, head))
-        own = pose_vertices(head, params, avatar.static_offset)
-        camera = aligned_camera(own, truth, head.masks["face"], view.camera)
+        camera = view.camera
+        if avatar.skinning == "surface":
+            # The avatar's own surface tells its size; on the template the Gaussians' offsets do, and need no help.
+            own = pose_vertices(head, params, avatar.static_offset)
+            camera = aligned_camera(own, truth, head.masks["face"], camera)
         pictures.append(rounded(render(avatar, params, camera, head, [background] * 3, canonical=canonical).rgb))
     return pictures
 
@@ -132,7 +144,7 @@ def target_views(samples: Sequence[Sample], protocol: Protocol, head: HeadModel)
     """
     for sample in samples:
         check_sample(sample, head)
-    return [View(sample, protocol.size) for sample in samples]
+    return [View(sample, protocol.size, head) for sample in samples]
 
 
 def truth_picture(view: View, background: float) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.data import DataError
-from uika.data.datasets import find_people
+from uika.data.datasets import find_people, left_out
 from uika.data.views import View
 from uika.errors import UikaError
 from uika.evaluate.external import check_external, external_picture
@@ -21,6 +21,7 @@ from uika.evaluate.protocol import Protocol
 from uika.evaluate.reenactment import Cutouts, drive, make_avatar, target_views, truth_picture
 from uika.evaluate.score import Judges, Pictures, faces_found, score
 from uika.evaluate.sequences import Sequence, choose_frames
+from uika.evaluate.settings import Evaluation, check_settings, protocol_of
 from uika.evaluate.store import (
     PICTURES,
     Result,
@@ -35,35 +36,13 @@ from uika.evaluate.strips import write_strip
 from uika.head import HeadModel, load_head
 from uika.io.files import check_folder
 from uika.io.progress import counted
-from uika.io.weights import sha256
 from uika.metrics.arcface import ArcFace
 from uika.metrics.lpips import Lpips
 from uika.photo import PhotoError
-from uika.reconstruction import MAX_PHOTOS, LoadedModel, load_model
+from uika.reconstruction import LoadedModel, check_loaded, load_model
 
 TRUTHS = 4  # sequences whose targets are remembered
 SHOWN = 2  # targets of each result that pictures are kept of
-_SIZES = (32, 2048)
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What to evaluate; meanings as in `uika evaluate`."""
-
-    data: Path
-    output: Path
-    setting: str = "mono"
-    task: str = "self"
-    views: tuple[int, ...] = (1, 2, 4, 8, 16)
-    model: str = "tiny"
-    name: str = ""
-    correspondence: str = "fit"
-    size: int = 512
-    background: float = 1.0
-    targets: int = 8
-    lpips: Path | None = None
-    arcface: Path | None = None
-    external: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -121,9 +100,11 @@ def evaluate_all(
     wanted = list(many)
     first = wanted[0]
     for settings in wanted:
-        _check(settings)
+        check_settings(settings)
     head = load_head() if head is None else head
-    loaded = None if first.external else load_model(first.model)
+    loaded = None if first.external else load_model(first.model, first.estimator, first.backbone)
+    if loaded is not None:
+        check_loaded(loaded, head, first.estimator)
     judges = Judges(
         head,
         None if first.lpips is None else Lpips(first.lpips),
@@ -150,7 +131,7 @@ def evaluate_all(
 
 def _plan(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> _Plan:
     """Choose frames, and make sure that the report's folder and another system's pictures fit them."""
-    protocol = _protocol(settings, loaded, head)
+    protocol = protocol_of(settings, loaded, head)
     missing: list[str] = []
     sequences = []
     for path in find_people(settings.data):
@@ -160,6 +141,7 @@ def _plan(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> 
             missing.append(str(error))
     if not sequences:
         raise UikaError(f"{settings.data}: no sequence can be used; the first reason: {missing[0]}")
+    missing += [note for each in sequences for note in left_out(each.person)]
     drivers = {each.name: _driver(sequences, index, settings) for index, each in enumerate(sequences)}
     jobs = []
     for sequence in sequences:
@@ -169,7 +151,7 @@ def _plan(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> 
             else:
                 missing.append(f"{sequence.name}: has {len(sequence.sources)} source frames, too few for {views} views")
     if not jobs:
-        raise UikaError(f"{settings.data}: no sequence has enough source frames; the first reason: {missing[0]}")
+        raise UikaError(f"{settings.data}: no sequence has enough source frames; the first reason: {missing[-1]}")
     if settings.external is not None:
         check_external(settings.external, [(s.name, v, drivers[s.name].target_names) for s, v in jobs])
     folder = agree(check_folder(settings.output), protocol)
@@ -199,7 +181,8 @@ class _Run:
             images = drive(avatar, truth.views, judges.head, protocol.background)
         # Between two people a result's face counts without one in the truth.
         results = Pictures.of(images, None if judges.arcface is not None else truth.pictures)
-        shown = truth_picture(View(sequence.person.sample(sequence.sources[0]), protocol.size), protocol.background)
+        (first,) = target_views([sequence.person.sample(sequence.sources[0])], protocol, judges.head)
+        shown = truth_picture(first, protocol.background)
         person = Pictures.of([shown] if judges.arcface is not None and protocol.task == "cross" else [])
         return Result(
             protocol=protocol.digest(),
@@ -264,36 +247,3 @@ def _driver(sequences: list[Sequence], index: int, settings: Evaluation) -> Sequ
 
 def _frames(sequence: Sequence, driver: Sequence) -> dict[str, object]:
     return {"sources": sequence.source_names, "driver": driver.name, "targets": driver.target_names}
-
-
-def _protocol(settings: Evaluation, loaded: LoadedModel | None, head: HeadModel) -> Protocol:
-    external = settings.external is not None
-    name = settings.name or (settings.external.name if settings.external else Path(settings.model).stem)
-    model = f"pictures in {name}" if loaded is None else f"model {loaded.name}"
-    if loaded is not None and Path(settings.model).is_file():
-        model = f"{model}, sha256 {sha256(Path(settings.model))[:12]}"
-    return Protocol(
-        data=settings.data.resolve().name,
-        setting=settings.setting,
-        task=settings.task,
-        method=name,
-        model=model,
-        correspondence="" if external else settings.correspondence,
-        head=head.id,
-        size=settings.size,
-        background=settings.background,
-        targets=settings.targets,
-        lpips="" if settings.lpips is None else sha256(settings.lpips)[:12],
-        arcface="" if settings.arcface is None else sha256(settings.arcface)[:12],
-    )
-
-
-def _check(settings: Evaluation) -> None:
-    if not settings.views or not all(1 <= count <= MAX_PHOTOS for count in settings.views):
-        raise UikaError(f"views must be numbers from 1 to {MAX_PHOTOS}, such as 1,2,4, not {list(settings.views)}")
-    if not _SIZES[0] <= settings.size <= _SIZES[1]:
-        raise UikaError(f"size must lie between {_SIZES[0]} and {_SIZES[1]} pixels, not {settings.size}")
-    if not 0 <= settings.background <= 1:
-        raise UikaError(f"background must be a grey level in [0,1], not {settings.background:g}")
-    if settings.targets < 1:
-        raise UikaError(f"targets must be at least 1, not {settings.targets}")

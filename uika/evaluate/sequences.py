@@ -16,6 +16,7 @@ from uika.head import HeadModel, rodrigues
 from uika.reconstruction import MAX_PHOTOS
 
 Place = tuple[int, str]  # time step and camera
+_MOST_STEPS = 2000  # of a sequence that are looked at; longer ones are thinned out evenly
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ def choose_frames(path: Path, setting: str, targets: int, head: HeadModel) -> Se
     directions = torch.stack([_direction(opening[camera]) for camera in cameras])
     cameras = [cameras[i] for i in farthest_first(directions)]
     steps = sorted({step for step, camera in place if camera in cameras})
+    steps = steps[:: -(-len(steps) // _MOST_STEPS)]
     if len(steps) > 1:
         pools = (steps[::2], cameras), (steps[1::2], cameras)
     else:

@@ -26,6 +26,13 @@ class Binding:
         """The number of points."""
         return len(self.texel)
 
+    def to(self, device: torch.device | str) -> Binding:
+        """A copy on another device; itself where it already is there."""
+        if self.texel.device == torch.device(device):
+            return self
+        moved = (part.to(device) for part in (self.texel, self.triangle, self.barycentric))
+        return Binding(self.size, *moved)
+
     @property
     def uv(self) -> Tensor:
         """Texel centres [M,2] in [0,1], v down."""

@@ -23,6 +23,7 @@ class WeightFile:
 
     name: str
     purpose: str
+    command: str  # that it unlocks
     licence: str
     source: str
     sha256: str
@@ -41,7 +42,9 @@ class WeightStatus:
 FILES = (
     WeightFile(
         name="uika.safetensors",
-        purpose="the authors' trained network with its estimator and backbone (read by uika.model.released.load)",
+        purpose="the authors' trained network with its estimator and backbone; needs FLAME 2023 (with jaw) as head",
+        command="uika reconstruct photo.jpg --model uika.safetensors --head flame.npz -o me.safetensors "
+        "(and uika evaluate --model)",
         licence="MIT; holds FLAME-derived tables under the FLAME licence and DINOv3 weights under the DINOv3 licence",
         source="https://huggingface.co/Yuukki/UIKA",
         sha256="a1d7f56e...eb46a",
@@ -49,7 +52,8 @@ FILES = (
     ),
     WeightFile(
         name="fuvt_15k.safetensors",
-        purpose="the authors' facial correspondence estimator alone, needed for training only",
+        purpose="the authors' facial correspondence estimator alone, for a FLAME head",
+        command="--estimator fuvt_15k.safetensors of uika reconstruct, track, evaluate and train",
         licence="MIT; holds DINOv3 weights under the DINOv3 licence",
         source="https://huggingface.co/Yuukki/UIKA",
         sha256="93163025...4e2a",
@@ -58,14 +62,25 @@ FILES = (
     WeightFile(
         name="dinov3_vitl16_pretrain_lvd1689m.safetensors",
         purpose="DINOv3 ViT-L/16, the frozen backbone for training at the paper's size",
+        command="uika train --preset paper --backbone FILE, and uika reconstruct --backbone for weights without one",
         licence="DINOv3 licence (to be accepted at the source)",
         source="https://huggingface.co/facebook/dinov3-vitl16-pretrain-lvd1689m (model.safetensors, renamed)",
         sha256="",
         gigabytes=1.2,
     ),
     WeightFile(
+        name="dinov3_vits16_pretrain_lvd1689m.safetensors",
+        purpose="DINOv3 ViT-S/16, the frozen backbone for training at the middle size, of both networks",
+        command="uika train --preset base --backbone FILE",
+        licence="DINOv3 licence (to be accepted at the source)",
+        source="https://huggingface.co/facebook/dinov3-vits16-pretrain-lvd1689m (model.safetensors, renamed)",
+        sha256="",
+        gigabytes=0.09,
+    ),
+    WeightFile(
         name="dinov3_vitb16_pretrain_lvd1689m.safetensors",
         purpose="DINOv3 ViT-B/16, the backbone of the estimator for training at the paper's size",
+        command="uika train --preset paper --part estimator --backbone FILE",
         licence="DINOv3 licence (to be accepted at the source)",
         source="https://huggingface.co/facebook/dinov3-vitb16-pretrain-lvd1689m (model.safetensors, renamed)",
         sha256="",

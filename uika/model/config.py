@@ -110,6 +110,8 @@ class ModelConfig:
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
     scope             "all", or "face_colors": what is predicted counts for the colours of the face alone, everything
                       else stays the surface with its completed observation; for weights that lose elsewhere
+    canonical         surface that Gaussians start on and are moved with: "personal", the head with the person's
+                      identity and hair, or "template", the mean head, as in the paper, where offsets hold the identity
     """
 
     name: str
@@ -133,6 +135,7 @@ class ModelConfig:
     detail: float = 0.0
     fusion: Literal["learned", "fixed"] = "learned"
     scope: Literal["all", "face_colors"] = "all"
+    canonical: Literal["personal", "template"] = "personal"
 
     def __post_init__(self) -> None:
         """Refuse combinations that cannot be built, naming the field."""
@@ -149,6 +152,7 @@ class ModelConfig:
             (self.token_grid % 2 == 0, "token_grid must be even"),
             (self.fusion in ("learned", "fixed"), 'fusion must be "learned" or "fixed"'),
             (self.scope in ("all", "face_colors"), 'scope must be "all" or "face_colors"'),
+            (self.canonical in ("personal", "template"), 'canonical must be "personal" or "template"'),
             (0 <= self.palette <= 64, "palette must lie in 0..64"),
             (0 <= self.detail <= 1, "detail must lie in [0,1]"),
             (0 <= self.gaussians.least_scale <= 1, "gaussians.least_scale must lie in [0,1]"),
@@ -241,6 +245,7 @@ PRESETS: dict[str, ModelConfig] = {
         mlp_width=512,
         uv=UvConfig(grid="corners", normalization="max", oversample=1, close_radius=0, fill=False),
         gaussians=GaussianConfig(relative=False),
+        canonical="template",
     ),
 }
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -12,6 +13,9 @@ from torch import Tensor
 
 from uika.model.backbone import VisionTransformer
 from uika.model.checkpoint import CheckpointError, listing
+from uika.model.config import BackboneConfig
+
+_T = TypeVar("_T")
 
 # Hugging Face's names on the left, ours (Meta's) on the right.
 _NAMES = {
@@ -28,6 +32,13 @@ _PARTS = {
     "mlp.down_proj": "mlp.fc2",
 }
 _QUERY_KEY_VALUE = re.compile(r"(.*)attention\.([qkv])_proj\.(weight|bias)")
+_PATCHES = ("patch_embed.proj.weight", "embeddings.patch_embeddings.weight")
+# Blocks, channels and patches of the published backbones that presets are made for.
+KNOWN = {
+    (12, 384, 16): "DINOv3 ViT-S/16",
+    (12, 768, 16): "DINOv3 ViT-B/16",
+    (24, 1024, 16): "DINOv3 ViT-L/16",
+}
 _CONVERT = (
     "python -c 'import sys, torch, safetensors.torch as s; t = torch.load(sys.argv[1], weights_only=True); "
     "s.save_file({k: v.contiguous() for k, v in t.items()}, sys.argv[2])'"
@@ -41,7 +52,7 @@ def load_backbone(model: VisionTransformer, path: str | Path) -> None:
         CheckpointError: the file is missing, damaged or a pickle, or its keys do not fit the model; it lists them.
     """
     path = Path(path)
-    tensors = from_any_format(_read(path))
+    tensors = read_backbone(path)
     expected = model.state_dict()
     for name, value in expected.items():
         # Hugging Face computes the periods and leaves out the keys' bias, which is switched off.
@@ -61,7 +72,47 @@ def load_backbone(model: VisionTransformer, path: str | Path) -> None:
     ]
     if any(problems):
         raise CheckpointError(f"{path}: does not fit this backbone: {'; '.join(filter(None, problems))}")
-    model.load_state_dict({name: tensors[name].float() for name in expected})
+    model.load_state_dict({name: tensors[name].float() for name in expected}, assign=True)
+
+
+def read_backbone(path: str | Path) -> dict[str, Tensor]:
+    """The tensors of a DINOv3 file under Meta's names, whichever of the two formats it has.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, a pickle, or no backbone.
+    """
+    path = Path(path)
+    tensors = from_any_format(_read(path, lambda file, name: file.get_tensor(name)))
+    if _PATCHES[0] not in tensors:
+        raise CheckpointError(f"{path}: holds no DINOv3 backbone; `uika weights` lists the files that do")
+    return tensors
+
+
+def check_backbone(path: str | Path, config: BackboneConfig) -> None:
+    """Make sure, from the file's header alone, that it holds a backbone of a size.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or a pickle, or of another size; one sentence says which.
+    """
+    path = Path(path)
+    shapes = _read(path, lambda file, name: tuple(file.get_slice(name).get_shape()))
+    names = [_plain(name) for name in shapes]
+    blocks = {int(found[1]) for name in names if (found := re.match(r"(?:blocks|layer)\.(\d+)\.", name))}
+    patches = [shape for name, shape in shapes.items() if name.endswith(_PATCHES) and len(shape) == 4]
+    if not blocks or len(patches) != 1:
+        raise CheckpointError(f"{path}: holds no DINOv3 backbone; `uika weights` lists the files that do")
+    found_size = (max(blocks) + 1, patches[0][0], patches[0][2])
+    if found_size != (config.depth, config.dim, config.patch_size):
+        raise CheckpointError(
+            f"{path}: holds a backbone of {found_size[0]} blocks, {found_size[1]} channels and patches of "
+            f"{found_size[2]} pixels, but {config.depth} blocks, {config.dim} channels and {config.patch_size} pixels "
+            f"are needed{_known(config)}"
+        )
+
+
+def _known(config: BackboneConfig) -> str:
+    name = KNOWN.get((config.depth, config.dim, config.patch_size))
+    return f" ({name})" if name else ""
 
 
 def from_any_format(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -71,7 +122,7 @@ def from_any_format(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     result: dict[str, Tensor] = {}
     thirds: dict[str, dict[str, Tensor]] = {}
     for full, value in tensors.items():
-        name = re.sub(r"^(?:model\.|backbone\.)*", "", full)
+        name = _plain(full)
         if found := _QUERY_KEY_VALUE.fullmatch(name):
             thirds.setdefault(_block(found[1]) + "attn.qkv." + found[3], {})[found[2]] = value
         else:
@@ -96,7 +147,12 @@ def _block(name: str) -> str:
     return re.sub(r"^layer\.", "blocks.", name)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def _plain(name: str) -> str:
+    return re.sub(r"^(?:model\.|backbone\.)*", "", name)
+
+
+def _read(path: Path, take: Callable[[Any, str], _T]) -> dict[str, _T]:
+    """What `take` finds in the opened file under each of its names."""
     if not path.is_file():
         raise CheckpointError(f"{path}: no such weight file; `uika weights` says where to get it")
     if path.suffix in (".pth", ".pt", ".bin"):
@@ -104,6 +160,6 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise CheckpointError(f"{path}: is a pickle, which is not read here; convert it where you trust it: {command}")
     try:
         with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
+            return {name: take(file, name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: damaged, truncated or no safetensors file ({error})") from error

@@ -8,40 +8,32 @@ black, blocks add attention to the tokens before a separate feed-forward, and fe
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from uika.canonical.surface import SurfaceTexels
+from uika.model.backbone import MaskedBiasLinear, RotaryPositions
 from uika.model.checkpoint import CheckpointError, listing
+from uika.model.dinov3 import read_backbone
 from uika.model.estimator import Estimator
+from uika.model.estimator_file import read_estimator
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.precision import Precision, arithmetic, halve
 from uika.model.reconstructor import Reconstructor
+from uika.model.released_estimator import load_estimator
+from uika.model.released_file import ESTIMATOR, PREFIXES, compare, fill, read_shapes, read_tensors, unused_reason
 from uika.model.released_sizes import SizeError, estimator_config, model_config
 from uika.model.view_features import FeatureCache, Keep, content_keys
+from uika.model.weight_kind import check_kind
 
-# Keys that belong to a released file and change no result here, with the reason.
-UNUSED = {
-    r".*\bmask_token": "stands for hidden patches while the backbone is pretrained",
-    r"transformer\.layers\.<last>\.attn2?\.(add_q_proj|norm_added_q)\.\w+": "asks for an update that nobody reads",
-    r"renderer\.flame_model\.(shapedirs|posedirs|J_regressor|lbs_weights)_pix": "animation is done by `uika.head`",
-    r"renderer\.flame_model\.(v_template|shapedirs|posedirs|J_regressor|parents|lbs_weights)": "the head model itself",
-    r"renderer\.flame_model\.(full_lmk_faces_idx|full_lmk_bary_coords|neck_kin_chain)": "landmarks of the head model",
-    r"renderer\.flame_model\.(uv_color_flatten|pix_to_face_flatten|faces|verts_uvs|textures_idx)": "for pictures only",
-}
 _TABLES = "renderer.flame_model."
-_PREFIXES = {
-    "encoder.": "network.encoder.",
-    "transformer.": "network.transformer.",
-    "gs_decoder.": "network.gs_decoder.",
-}
-_ESTIMATOR, _ESTIMATOR_FILE = "uv_wrapper.model.", "fuvt."
-_TENSORS_AT_ONCE = 32
+_BACKBONE = "encoder.model."
+_HEAD_WIDTH = 64  # channels of an attention head of every published backbone that stands in
+
+__all__ = ["ReleasedModel", "load", "load_estimator"]
 
 
 class ReleasedModel(nn.Module):
@@ -119,6 +111,7 @@ def load(
     *,
     dtype: torch.dtype = torch.float32,
     estimator: str | Path | None = None,
+    backbone: str | Path | None = None,
     texels: tuple[Tensor, Tensor] | None = None,
     strict: bool = True,
 ) -> ReleasedModel:
@@ -127,7 +120,8 @@ def load(
     Args:
         path: the file.
         dtype: torch.float32 maps the file into memory; torch.bfloat16 halves the weights while reading.
-        estimator: a `fuvt_*.safetensors` file to take the estimator from, instead of the one inside.
+        estimator: a file to take the estimator from, instead of the one inside: `fuvt_*.safetensors` or of our own.
+        backbone: a DINOv3 file for the image encoder, instead of the one inside; needed where there is none inside.
         texels: valid texels [M] (int64, row-major) and template points [M,3] for a file without the head's tables.
         strict: False takes no offence at keys that belong to no known part.
 
@@ -135,8 +129,13 @@ def load(
         CheckpointError: the file is missing or damaged, or keys are missing, misshapen or unknown; it lists them.
     """
     path = Path(path)
-    shapes = _shapes(path)
+    check_kind(path, ("released model",))
+    shapes = read_shapes(path)
     tables = _tables(path, shapes, texels)
+    given = _given(path, shapes, backbone)
+    replaced = {name: "another backbone is used" for name in shapes if given and name.startswith(_BACKBONE)}
+    shapes = {name: shape for name, shape in shapes.items() if name not in replaced}
+    shapes |= {name: tuple(value.shape) for name, value in given.items()}
     inside = {name: shape for name, shape in shapes.items() if not name.startswith(_TABLES)}
     map_size = (
         math.isqrt(shapes[_TABLES + "valid_mask_flatten"][0]) if _TABLES + "valid_mask_flatten" in shapes else None
@@ -146,10 +145,11 @@ def load(
     try:
         with torch.device("meta"):
             network = Reconstructor(model_config(shapes, map_size))
-            own = None if estimator is not None else Estimator(estimator_config(shapes, _ESTIMATOR))
+            own = None if estimator is not None else Estimator(estimator_config(shapes, ESTIMATOR))
     except SizeError as error:
         raise CheckpointError(f"{path}: {listing('missing or misshapen', error.names)}") from error
-    model = ReleasedModel(network, own or load_estimator(estimator or path, dtype=dtype), tables)
+    located = own if own is not None else read_estimator(estimator or path)
+    model = ReleasedModel(network, located, tables)
     if dtype == torch.bfloat16:
         model.halve()
     elif dtype != torch.float32:
@@ -161,39 +161,53 @@ def load(
         if name.startswith("network.") or (own is not None and name.startswith("estimator."))
     }
     last = str(network.config.layers - 1)
-    model.unused = {name: reason for name in shapes if (reason := _reason(name, last))}
+    model.unused = {name: reason for name in shapes if (reason := unused_reason(name, last))}
     taken = {old for new, old in names.items() if new in expected}
     if estimator is not None:
-        model.unused |= {name: "another file's estimator is used" for name in shapes if name.startswith(_ESTIMATOR)}
+        model.unused |= {name: "another file's estimator is used" for name in shapes if name.startswith(ESTIMATOR)}
     read = {f"{_TABLES}{name}" for name in ("valid_mask_flatten", "v_template_pix", *_BINDING)}
     known = taken | set(model.unused) | read
+    model.unused |= replaced
     strangers = [name for name in shapes if name not in known] if strict else []
-    _compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, strangers)
-    _fill(model, path, {name: names[name] for name in expected}, expected)
+    compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, strangers)
+    fill(model, path, {name: names[name] for name in expected if names[name] not in given}, expected)
+    if given:
+        encoder = {f"network.{name}": value.float() for name, value in given.items() if f"network.{name}" in expected}
+        model.load_state_dict(
+            {name: value.to(expected[name].dtype) for name, value in encoder.items()}, strict=False, assign=True
+        )
+        model.requires_grad_(False)
     return model.eval()
 
 
-def load_estimator(path: str | Path, dtype: torch.dtype = torch.float32) -> Estimator:
-    """Read the estimator from `fuvt_*.safetensors` (keys `fuvt.*`; the rest of that file is its teacher).
+def _given(path: Path, shapes: Mapping[str, tuple[int, ...]], backbone: str | Path | None) -> dict[str, Tensor]:
+    """The tensors of a backbone's own file under the released names; empty where the file's own is used.
 
-    Raises CheckpointError like `load`.
+    Raises:
+        CheckpointError: there is no backbone in either file, or it is of another size than the weights around it.
     """
-    path = Path(path)
-    shapes = _shapes(path)
-    prefix = _ESTIMATOR_FILE if any(name.startswith(_ESTIMATOR_FILE) for name in shapes) else _ESTIMATOR
-    try:
-        with torch.device("meta"):
-            model = Estimator(estimator_config(shapes, prefix))
-    except SizeError as error:
-        raise CheckpointError(f"{path}: {listing('missing or misshapen', error.names)}") from error
-    if dtype == torch.bfloat16:
-        halve(model, exempt=(model.uv_head,))
-    names = {name.removeprefix(prefix): name for name in shapes if name.startswith(prefix)}
-    expected = model.state_dict()
-    strangers = [old for new, old in names.items() if new not in expected and not _reason(old, "")]
-    _compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, strangers)
-    _fill(model, path, {name: names[name] for name in expected}, expected)
-    return model.eval()
+    inside = any(name.startswith(_BACKBONE) and not name.endswith("mask_token") for name in shapes)
+    fused = shapes.get("encoder.fusion_head.projects.0.weight", (0, 0))[1]
+    if backbone is None:
+        if not inside:
+            raise CheckpointError(
+                f"{path}: holds no image encoder of its own; give the DINOv3 backbone of {fused} channels that it was "
+                "trained with as --backbone (`uika weights` says where to get it)"
+            )
+        return {}
+    tensors = read_backbone(backbone)
+    dim = tensors["patch_embed.proj.weight"].shape[0]
+    if fused and dim != fused:
+        raise CheckpointError(
+            f"{backbone}: is a backbone of {dim} channels, but {path} was trained with one of {fused}; "
+            "`uika weights` says where to get that"
+        )
+    # Hugging Face's files leave out what follows from the size.
+    tensors.setdefault("rope_embed.periods", RotaryPositions(_HEAD_WIDTH).periods)
+    blocks = {name.split(".")[1] for name in tensors if name.startswith("blocks.")}
+    for block in blocks:
+        tensors.setdefault(f"blocks.{block}.attn.qkv.bias_mask", MaskedBiasLinear(dim).bias_mask)
+    return {_BACKBONE + name: value for name, value in tensors.items() if name != "mask_token"}
 
 
 _BINDING = ("pix_to_v_idx_flatten", "pix_bary_flatten")
@@ -201,67 +215,9 @@ _BINDING = ("pix_to_v_idx_flatten", "pix_bary_flatten")
 
 def _mapped(name: str) -> str | None:
     """This program's name of a released key."""
-    if name.startswith(_ESTIMATOR):
-        return "estimator." + name.removeprefix(_ESTIMATOR)
-    return next((new + name.removeprefix(old) for old, new in _PREFIXES.items() if name.startswith(old)), None)
-
-
-def _reason(name: str, last: str) -> str | None:
-    return next((why for rule, why in UNUSED.items() if re.fullmatch(rule.replace("<last>", last), name)), None)
-
-
-def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such model file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: damaged, truncated or no safetensors file ({error})") from error
-
-
-def _compare(
-    path: Path,
-    expected: Mapping[str, tuple[int, ...]],
-    shapes: Mapping[str, tuple[int, ...]],
-    names: Mapping[str, str],
-    strangers: list[str],
-) -> None:
-    missing = [name for name in expected if name not in names]
-    wrong = [
-        f"{names[name]} {list(shapes[names[name]])} instead of {list(shape)}"
-        for name, shape in expected.items()
-        if name in names and shapes[names[name]] != shape
-    ]
-    problems = [
-        listing("missing", [_released(name) for name in missing]),
-        listing("misshapen", wrong),
-        listing("unknown (strict=False ignores these)", strangers),
-    ]
-    if any(problems):
-        raise CheckpointError(f"{path}: {'; '.join(filter(None, problems))}")
-
-
-def _released(name: str) -> str:
-    back = {new: old for old, new in _PREFIXES.items()} | {"estimator.": _ESTIMATOR}
-    return next((old + name.removeprefix(new) for new, old in back.items() if name.startswith(new)), name)
-
-
-def _fill(model: nn.Module, path: Path, names: Mapping[str, str], expected: Mapping[str, Tensor]) -> None:
-    """Give the model its tensors: views of the file where all types fit, else copies that do not hold on to it."""
-    copy = any(value.dtype == torch.bfloat16 for value in expected.values())
-    tensors = {new: tensor.to(expected[new].dtype, copy=copy) for new, tensor in _tensors(path, names)}
-    model.load_state_dict(tensors, strict=False, assign=True)
-    model.requires_grad_(False)
-
-
-def _tensors(path: Path, names: Mapping[str, str]) -> Iterator[tuple[str, Tensor]]:
-    """(new name, tensor) of each; the file is opened anew now and then, which gives back what was read of it."""
-    waiting = list(names.items())
-    for first in range(0, len(waiting), _TENSORS_AT_ONCE):
-        with safe_open(path, framework="pt") as file:
-            for new, old in waiting[first : first + _TENSORS_AT_ONCE]:
-                yield new, file.get_tensor(old)
+    if name.startswith(ESTIMATOR):
+        return "estimator." + name.removeprefix(ESTIMATOR)
+    return next((new + name.removeprefix(old) for old, new in PREFIXES.items() if name.startswith(old)), None)
 
 
 def _tables(
@@ -278,7 +234,7 @@ def _tables(
             f"{path}: {listing('missing', lacking)}; give `texels` for a file without the head's tables"
         )
     optional = {short: _TABLES + name for short, name in zip(("corners", "barycentric"), _BINDING, strict=True)}
-    read = dict(_tensors(path, found | {short: name for short, name in optional.items() if name in shapes}))
+    read = dict(read_tensors(path, found | {short: name for short, name in optional.items() if name in shapes}))
     texel = read["valid"].bool().nonzero()[:, 0]
     counts = {names.get(short, short): len(value) for short, value in read.items() if short != "valid"}
     if any(count != len(texel) for count in counts.values()):

@@ -3,7 +3,7 @@
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_files, fit_prepared, prepare_file
 from uika.reconstruction.incremental import GrowingAvatar
-from uika.reconstruction.models import LoadedModel, check_model, load_model
+from uika.reconstruction.models import LoadedModel, check_loaded, check_model, load_model
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, Reconstruction, assemble, avatar_from_fit, reconstruct
 from uika.reconstruction.report import Report
 
@@ -18,6 +18,7 @@ __all__ = [
     "Report",
     "assemble",
     "avatar_from_fit",
+    "check_loaded",
     "check_model",
     "fit_files",
     "fit_prepared",

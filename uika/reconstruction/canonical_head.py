@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from uika.canonical.surface import surface_texels
+from uika.canonical.surface import SurfaceTexels, surface_texels
 from uika.head import HeadModel
 from uika.reconstruction.models import LoadedModel
 from uika.reconstruction.report import Report
@@ -21,35 +21,48 @@ _UNTRAINED_OPACITY = 0.95
 
 
 class CanonicalHead:
-    """The surface of one fitted person, and the photos whose colours and features it has taken in."""
+    """The surface that one person's Gaussians start on, and the photos whose colours and features it has taken in."""
 
     def __init__(
-        self, loaded: LoadedModel, head: HeadModel, fit: Fit, keep: Keep = "all", *, growing: bool = False
+        self, loaded: LoadedModel, head: HeadModel, fit: Fit | None, keep: Keep = "all", *, growing: bool = False
     ) -> None:
         """Prepare the surface.
 
         Args:
             loaded: the model.
             head: the head model.
-            fit: says identity and hair; its photos are not added.
+            fit: says identity and hair, if the model needs them; its photos are not added.
             keep: as in `uika.reconstruct`.
             growing: whether photos come in several calls of `add`, for which the network's contexts are kept.
+
+        Raises:
+            CheckpointError: the model's weights were made for another head model.
         """
         from uika.model import Session
 
-        identity, config = fit.parameters.identity[0], loaded.network.config
-        self._head, self._config, self._static_offset = head, config, fit.static_offset
-        self._surface, self.binding = surface_texels(head, identity, fit.static_offset, config.map_size)
-        self._levels: list[Tensor] = []
-        self._session = Session(loaded.network, self.binding.texel, self._surface, keep, self._prior, growing=growing)
-        self._run = loaded.run
+        self.identity = torch.zeros(len(head.identity_basis))
+        self.static_offset = torch.zeros_like(head.template)
+        config, prior = loaded.network.config, None
+        if loaded.on_template:
+            self.binding, points = loaded.template(head)
+            upright = torch.eye(4)[:1].expand(len(points), -1)
+            self._surface = SurfaceTexels(points[None], upright[None], torch.ones_like(points)[None])
+        else:
+            assert fit is not None  # LoadedModel.needs_fit
+            self.identity, self.static_offset = fit.parameters.identity[0].clone(), fit.static_offset
+            self._surface, self.binding = surface_texels(head, self.identity, self.static_offset, config.map_size)
+            prior = self._prior
+        self._head, self._config = head, config
+        self._estimator, self._levels = loaded.estimator, list[Tensor]()
+        self._session = Session(loaded.network, self.binding.texel, self._surface, keep, prior, growing=growing)
+        self._run, self._on_template = loaded.run, loaded.on_template
 
     @torch.no_grad()
-    def add(self, fit: Fit, images: Tensor, mattes: Tensor, report: Report) -> tuple[Tensor, ...]:
+    def add(self, fit: Fit | None, images: Tensor, mattes: Tensor, report: Report) -> tuple[Tensor, ...]:
         """The Gaussians of all photos so far and N new ones, fitted to this identity.
 
         Args:
-            fit: heads and cameras of the new photos.
+            fit: heads and cameras of the new photos, if the model needs them.
             images: [N,3,S,S] sRGB in [0,1] on one plain colour.
             mattes: [N,S,S] in [0,1].
             report: gets times and counts.
@@ -57,15 +70,15 @@ class CanonicalHead:
         Returns:
             Means [1,M,3], quats [1,M,4], scales [1,M,3], opacities [1,M] and colours [1,M,3].
         """
-        from uika.fitting import pixel_uv
         from uika.reconstruction.model_inputs import levels, plausible
 
         with report.stage("correspondence"):
-            uv, valid, weight = pixel_uv(fit, self._head, mattes)
-            uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)[None]
+            uv, weight = self._located(fit, images, mattes)
         with report.stage("reconstruction"):
             self._levels.append(levels(images, weight))
-            weights = weight[None, :, None] * plausible(self._head, self.binding, uv)
+            weights = weight[None, :, None]
+            if not self._on_template:
+                weights = weights * plausible(self._head, self.binding, uv)
             views = images[None], mattes[None, :, None], uv, weights
             if self._run:
                 result = self._session.add(*views)
@@ -77,10 +90,21 @@ class CanonicalHead:
             opacities = torch.full((1, len(self.binding)), _UNTRAINED_OPACITY)
             return self._surface.points, self._surface.quats, self._surface.scales, opacities, colors
 
+    def _located(self, fit: Fit | None, images: Tensor, mattes: Tensor) -> tuple[Tensor, Tensor]:
+        """UV maps [1,N,2,S,S], NaN where a pixel shows no part of the head, and the trust [N,S,S] in them."""
+        if self._estimator is not None:
+            uv = self._estimator(images[None]).float()
+            return torch.where(mattes[None, :, None] > 0, uv, torch.nan), mattes
+        from uika.fitting import pixel_uv
+
+        assert fit is not None  # LoadedModel.needs_fit
+        uv, valid, weight = pixel_uv(fit, self._head, mattes)
+        return torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)[None], weight
+
     def _prior(self, sums: Sums) -> Tensor:
         """Colours [3,S,S] for what no photo shows, from all photos pooled."""
         from uika.reconstruction.model_inputs import surface_prior
         from uika.uv import pool
 
         shown = torch.cat(self._levels)
-        return surface_prior(self._config, self._head, self.binding, self._static_offset, pool(sums), shown)
+        return surface_prior(self._config, self._head, self.binding, self.static_offset, pool(sums), shown)

@@ -17,6 +17,7 @@ from uika.reconstruction.report import Report
 if TYPE_CHECKING:
     from uika.fitting import Fit
     from uika.photo import Photo
+    from uika.reconstruction.models import LoadedModel
 
 
 class PreparedPhoto(NamedTuple):
@@ -30,14 +31,19 @@ class FittedPhotos(NamedTuple):
     """N photos of one person and the heads and cameras fitted to them."""
 
     photos: tuple[Photo, ...]
-    fit: Fit
+    fit: Fit | None  # None for a model that needs none
     images: Tensor  # [N,3,S,S] on one plain colour
     mattes: Tensor  # [N,S,S] in [0,1]
     digests: list[str]  # of the files
 
 
 def fit_files(
-    photos: Sequence[str | Path], head: HeadModel, *, refine: bool = True, report: Report | None = None
+    photos: Sequence[str | Path],
+    head: HeadModel,
+    *,
+    refine: bool = True,
+    report: Report | None = None,
+    loaded: LoadedModel | None = None,
 ) -> FittedPhotos:
     """Read photos of one person and fit the head to them; they come out in the order of their content hashes.
 
@@ -47,7 +53,7 @@ def fit_files(
     report = Report() if report is None else report
     with report.stage("photos"):
         prepared = prepare_files(photos)
-    return fit_prepared(prepared, head, refine=refine, report=report)
+    return fit_prepared(prepared, head, refine=refine, report=report, loaded=loaded)
 
 
 def prepare_files(paths: Sequence[str | Path]) -> list[PreparedPhoto]:
@@ -87,6 +93,7 @@ def fit_prepared(
     refine: bool = True,
     report: Report | None = None,
     known: Fit | None = None,
+    loaded: LoadedModel | None = None,
 ) -> FittedPhotos:
     """Fit the head to prepared photos of one person; they come out in the order of their content hashes.
 
@@ -96,16 +103,28 @@ def fit_prepared(
         refine: whether to refine the fit with the colours that the photos share.
         report: gets the time.
         known: an earlier fit of the person, whose identity and hair are kept.
+        loaded: the model that they are for; None fits the head and leaves the photos as they are.
     """
-    from uika.fitting import fit_photos
-
     report = Report() if report is None else report
     ordered = sorted(prepared, key=lambda each: each.photo.sha256)
     photos = [each.photo for each in ordered]
-    with report.stage("fit"):
-        pictures = [photo.image for photo in photos] if refine else None
-        focals = [photo.focal for photo in photos]
-        fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures, focals=focals, known=known)
-    images = torch.stack([photo.image for photo in photos])
-    mattes = torch.stack([photo.matte for photo in photos])
+    fit = None
+    if loaded is None or loaded.needs_fit:
+        from uika.fitting import fit_photos
+
+        with report.stage("fit"):
+            pictures = [photo.image for photo in photos] if refine else None
+            focals = [photo.focal for photo in photos]
+            fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures, focals=focals, known=known)
+    pairs = [(photo.image, photo.matte) for photo in photos]
+    if loaded is not None and loaded.released is not None:
+        pairs = [released_view(photo) for photo in photos]
+    images, mattes = (torch.stack(parts) for parts in zip(*pairs, strict=True))
     return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos])
+
+
+def released_view(photo: Photo) -> tuple[Tensor, Tensor]:
+    """A photo [3,512,512] and mask [512,512] as the released program hands them to its network."""
+    from uika.photo.square_view import prepare_reference
+
+    return prepare_reference(photo.original.permute(1, 2, 0).numpy(), photo.matte.numpy())

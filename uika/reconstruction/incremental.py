@@ -11,7 +11,7 @@ from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import PreparedPhoto, fit_prepared, prepare_files
-from uika.reconstruction.models import load_model
+from uika.reconstruction.models import check_loaded, load_model
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble
 from uika.reconstruction.report import Report
 
@@ -27,17 +27,26 @@ class GrowingAvatar:
     encoded alone. `refresh` fits and reconstructs all photos together, as `uika.reconstruct` does.
     """
 
-    def __init__(self, model: str | Path = "tiny", head: HeadModel | None = None, keep: Keep = "all") -> None:
+    def __init__(
+        self,
+        model: str | Path = "tiny",
+        head: HeadModel | None = None,
+        keep: Keep = "all",
+        *,
+        estimator: str | Path | None = None,
+        backbone: str | Path | None = None,
+    ) -> None:
         """Arguments as in `uika.reconstruct`.
 
         Raises:
             ValueError: the model's name or file cannot be used.
         """
-        self._loaded = load_model(model)
+        self._loaded = load_model(model, estimator, backbone)
         self._head = load_head() if head is None else head
+        check_loaded(self._loaded, self._head, estimator)
         self._keep: Keep = keep
         self._photos: list[PreparedPhoto] = []
-        self._first: tuple[Fit, CanonicalHead] | None = None
+        self._first: tuple[Fit | None, CanonicalHead] | None = None
 
     def __len__(self) -> int:
         """The number of photos."""
@@ -75,10 +84,11 @@ class GrowingAvatar:
         self,
         before: Sequence[PreparedPhoto],
         new: Sequence[PreparedPhoto],
-        first: tuple[Fit, CanonicalHead] | None,
+        first: tuple[Fit | None, CanonicalHead] | None,
         report: Report,
     ) -> Avatar:
-        found = fit_prepared(new, self._head, report=report, known=None if first is None else first[0])
+        known = None if first is None else first[0]
+        found = fit_prepared(new, self._head, report=report, known=known, loaded=self._loaded)
         fit, canonical = first or (
             found.fit,
             CanonicalHead(self._loaded, self._head, found.fit, self._keep, growing=True),
@@ -86,4 +96,4 @@ class GrowingAvatar:
         gaussians = canonical.add(found.fit, found.images, found.mattes, report)
         self._first, self._photos = (fit, canonical), [*before, *new]
         digests = sorted(each.photo.sha256 for each in self._photos)
-        return assemble(self._loaded.name, self._head, fit, gaussians, canonical.binding, digests)
+        return assemble(self._loaded, self._head, canonical, gaussians, digests)

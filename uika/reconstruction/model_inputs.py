@@ -10,7 +10,7 @@ from torch import Tensor
 
 from uika.canonical.prior import prior_colors
 from uika.canonical.regions import MOUTH, regions
-from uika.canonical.surface import surface_texels
+from uika.canonical.surface import surface_texels, template_texels
 from uika.head import Binding, HeadModel
 from uika.model import ModelConfig, SurfaceTexels
 from uika.uv import Aggregate, aggregate
@@ -52,8 +52,12 @@ def model_inputs(
         uv: [N,2,H,W] correspondences with v down, NaN where a pixel shows no part of the head.
         weight: [N,H,W] trust in them, in [0,1].
     """
-    surface, binding = surface_texels(head, identity, static_offset, config.map_size)
     views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
+    if config.canonical == "template":
+        # Every pixel counts, nothing is supposed: what no photo shows is the network's to say.
+        surface, binding = template_texels(head, config.map_size)
+        return ModelInputs(views, masks, uvs, weights, binding.texel, surface), binding
+    surface, binding = surface_texels(head, identity, static_offset, config.map_size)
     weights = weights * plausible(head, binding, uvs)
     oversample = config.uv.oversample
     pooled = aggregate(views, uvs, masks, binding.size, weights=weights, oversample=oversample)

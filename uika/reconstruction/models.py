@@ -9,39 +9,113 @@ from uika.assets import TINY_WEIGHTS
 from uika.errors import UikaError
 
 if TYPE_CHECKING:
-    from uika.model import Reconstructor
+    from torch import Tensor
+
+    from uika.head import Binding, HeadModel
+    from uika.model import Estimator, Reconstructor
+    from uika.model.released import ReleasedModel
+
+_NAMES = ("tiny", "none")
 
 
 class LoadedModel(NamedTuple):
-    """A network, its name for the avatar's provenance, and whether it is run or only says what the photos show."""
+    """A network, its name for the avatar's provenance, and what it runs on."""
 
     network: Reconstructor
     name: str
-    run: bool
+    run: bool  # or only say what the photos show
+    estimator: Estimator | None = None  # finds the correspondence, else the fitted head does
+    released: ReleasedModel | None = None  # the network with its tables, if it is the authors'
+
+    @property
+    def on_template(self) -> bool:
+        """Whether Gaussians start on the mean head, so that a photo needs no identity."""
+        return self.network.config.canonical == "template"
+
+    @property
+    def needs_fit(self) -> bool:
+        """Whether heads must be fitted to the photos."""
+        return self.estimator is None or not self.on_template
+
+    def template(self, head: HeadModel) -> tuple[Binding, Tensor]:
+        """Where the Gaussians of a model on the template sit, and the points [M,3] that they start from.
+
+        Raises:
+            CheckpointError: the weights were made for another head model.
+        """
+        from uika.canonical.surface import template_texels
+
+        if self.released is not None:
+            from uika.model.released_binding import template_binding
+
+            return template_binding(self.released, head, self.name), self.released.points
+        surface, binding = template_texels(head, self.network.config.map_size)
+        return binding, surface.points[0]
 
 
-def check_model(model: str | Path) -> None:
-    """Refuse a model that `reconstruct` could not use, before other work starts.
+def check_model(model: str | Path, estimator: str | Path | None = None, backbone: str | Path | None = None) -> None:
+    """Refuse files that `reconstruct` could not use, from their headers, before other work starts.
 
     Raises:
-        UikaError: it is neither a built-in name nor an existing file.
+        UikaError: the model is neither a built-in name nor an existing file, or a file is of no use for it.
+        CheckpointError: a file holds something else than its place asks for.
     """
-    if str(model) not in ("tiny", "none") and not Path(model).is_file():
+    if str(model) not in _NAMES and not Path(model).is_file():
         raise UikaError(f"{model}: no such model; use 'tiny', 'none' or the path of a trained model (.safetensors)")
+    from uika.model.weight_kind import ESTIMATORS, MODELS, check_kind
+
+    kind = "model" if str(model) in _NAMES else check_kind(model, MODELS)
+    if estimator is not None:
+        check_kind(estimator, ESTIMATORS)
+    if backbone is not None:
+        if kind != "released model":
+            raise UikaError(
+                f"--backbone {backbone}: model '{model}' brings its own backbone; only released weights take another"
+            )
+        check_kind(backbone, ("backbone",))
 
 
-def load_model(model: str | Path) -> LoadedModel:
+def load_model(
+    model: str | Path, estimator: str | Path | None = None, backbone: str | Path | None = None
+) -> LoadedModel:
     """The model of a name or file that `reconstruct` takes.
 
     Raises:
-        ValueError: the name or file cannot be used.
+        ValueError: a name or file cannot be used.
     """
     from uika.model import build, load_checkpoint
+    from uika.model.estimator_file import read_estimator
+    from uika.model.weight_kind import weight_kind
 
-    check_model(model)
+    check_model(model, estimator, backbone)
+    if str(model) not in _NAMES and weight_kind(model) == "released model":
+        from uika.model import released
+
+        whole = released.load(model, estimator=estimator, backbone=backbone)
+        return LoadedModel(whole.network, f"released ({Path(model).name})", True, whole.estimator, whole)
+    located = None if estimator is None else read_estimator(estimator)
     if str(model) == "tiny":
-        return LoadedModel(load_checkpoint(TINY_WEIGHTS), "tiny", True)
+        return LoadedModel(load_checkpoint(TINY_WEIGHTS), "tiny", True, located)
     if str(model) == "none":
-        return LoadedModel(build("tiny").eval(), "none", False)
+        return LoadedModel(build("tiny").eval(), "none", False, located)
     network = load_checkpoint(model)
-    return LoadedModel(network, f"{network.config.name} ({Path(model).name})", True)
+    return LoadedModel(network, f"{network.config.name} ({Path(model).name})", True, located)
+
+
+def check_loaded(loaded: LoadedModel, head: HeadModel, estimator: str | Path | None = None) -> None:
+    """Refuse weights that were made for another head model.
+
+    Args:
+        loaded: the model.
+        head: the head model.
+        estimator: the estimator's file, if it was given.
+
+    Raises:
+        CheckpointError: the sentence says which weights, and which head they need.
+    """
+    from uika.model.estimator_file import check_estimator_head
+
+    if estimator is not None:
+        check_estimator_head(estimator, head)
+    if loaded.on_template:
+        loaded.template(head)

@@ -13,10 +13,10 @@ from torch import Tensor
 from uika._version import __version__
 from uika.avatar import Avatar
 from uika.errors import UikaError
-from uika.head import Binding, HeadModel, load_head
+from uika.head import HeadModel, load_head
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
-from uika.reconstruction.models import LoadedModel, load_model
+from uika.reconstruction.models import LoadedModel, check_loaded, load_model
 from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Reconstruction:
 
     avatar: Avatar
     photos: tuple[Photo, ...]
-    fit: Fit
+    fit: Fit | None  # None for a model that needs none
     report: Report
 
 
@@ -42,6 +42,8 @@ def reconstruct(
     head: HeadModel | None = None,
     model: str | Path = "tiny",
     *,
+    estimator: str | Path | None = None,
+    backbone: str | Path | None = None,
     refine: bool = True,
     keep: Keep = "all",
     report: Report | None = None,
@@ -54,7 +56,10 @@ def reconstruct(
         photos: 1 to 64 photo files, each showing the face.
         head: the head model; None loads the one that `uika.head.load_head` finds.
         model: "tiny", the built-in network; "none", which keeps the photos' colours on the fitted surface and runs no
-            network; or the path of a trained model (.safetensors).
+            network; or the path of a trained model (.safetensors), the authors' released one among them.
+        estimator: a correspondence estimator that says what each pixel shows, in the place of the fitted head or of the
+            one that released weights bring.
+        backbone: DINOv3 weights for released weights without their own.
         refine: whether to refine the fit with the colours that two or more photos share.
         keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
         report: filled while the stages pass; None makes a new one.
@@ -68,9 +73,10 @@ def reconstruct(
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
     report = Report() if report is None else report
     with report.stage("model"):
-        loaded = load_model(model)
+        loaded = load_model(model, estimator, backbone)
         head = load_head() if head is None else head
-    observed = fit_files(photos, head, refine=refine, report=report)
+        check_loaded(loaded, head, estimator)
+    observed = fit_files(photos, head, refine=refine, report=report, loaded=loaded)
     avatar = avatar_from_fit(
         loaded, head, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
     )
@@ -81,7 +87,7 @@ def reconstruct(
 def avatar_from_fit(
     loaded: LoadedModel,
     head: HeadModel,
-    fit: Fit,
+    fit: Fit | None,
     images: Tensor,
     mattes: Tensor,
     digests: Sequence[str],
@@ -93,7 +99,7 @@ def avatar_from_fit(
     Args:
         loaded: the model.
         head: the head model.
-        fit: heads and cameras of N photos.
+        fit: heads and cameras of N photos, if the model needs them.
         images: [N,3,S,S] sRGB in [0,1] on one plain colour.
         mattes: [N,S,S] in [0,1].
         digests: what identifies the photos, for the avatar's provenance.
@@ -102,18 +108,19 @@ def avatar_from_fit(
     """
     canonical = CanonicalHead(loaded, head, fit, keep)
     gaussians = canonical.add(fit, images, mattes, report)
-    return assemble(loaded.name, head, fit, gaussians, canonical.binding, digests)
+    return assemble(loaded, head, canonical, gaussians, digests)
 
 
 def assemble(
-    model: str, head: HeadModel, fit: Fit, gaussians: Iterable[Tensor], binding: Binding, digests: Sequence[str]
+    loaded: LoadedModel, head: HeadModel, canonical: CanonicalHead, gaussians: Iterable[Tensor], digests: Sequence[str]
 ) -> Avatar:
-    """An avatar of means, quats, scales, opacities and colours, batch dimension 1, made by the model of this name."""
+    """An avatar of means, quats, scales, opacities and colours, batch dimension 1, on its canonical head."""
+    binding = canonical.binding
     means, quats, scales, opacities, colors = (part[0] for part in gaussians)
     return Avatar(
         head_id=head.id,
-        identity=fit.parameters.identity[0].clone(),
-        static_offset=fit.static_offset,
+        identity=canonical.identity.clone(),
+        static_offset=canonical.static_offset,
         means=means,
         quats=quats,
         scales=scales,
@@ -123,7 +130,8 @@ def assemble(
         barycentric=binding.barycentric,
         provenance={
             "program": f"uika-drjit {__version__}",
-            "model": model,
+            "model": loaded.name,
             "photos": " ".join(digests),
         },
+        skinning="released" if loaded.on_template else "surface",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from uika.tracking.appearance import BLURS, LANDMARK_PULL, learn_appearance, tra
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate
 from uika.tracking.poses import poses_between, poses_to_motion, without_gaps
 
+# A frame [H,W,3] sRGB and its face mesh [478,2] in pixels -> the face mesh in better places.
+PlaceLandmarks = Callable[[NDArray[np.uint8], Array], Array]
 IDENTITY_FRAMES = 8  # the first guess of identity and focal length comes from these
 KEY_FRAMES = 12  # at least; the person's colours and final identity come from these
 MAX_FRAMES = 100_000
@@ -63,7 +65,12 @@ class _Seen:
 
 
 def track_video(
-    path: str | Path, head: HeadModel | None = None, *, smooth: bool = True, progress: bool = False
+    path: str | Path,
+    head: HeadModel | None = None,
+    *,
+    smooth: bool = True,
+    progress: bool = False,
+    place: PlaceLandmarks | None = None,
 ) -> Track:
     """Find how the head in a video moves.
 
@@ -72,6 +79,7 @@ def track_video(
         head: the head model to move; None loads the one that `uika.head.load_head` finds.
         smooth: whether to take jitter out of the motion.
         progress: whether to show progress bars on stderr.
+        place: moves the landmarks that were detected in a frame; None leaves them where they are.
 
     Raises:
         VideoError: the file is missing, unreadable, or shows no face.
@@ -79,7 +87,7 @@ def track_video(
     head = load_head() if head is None else head
     seconds: dict[str, float] = {}
     start = time.perf_counter()
-    seen = _look(Path(path), progress)
+    seen = _look(Path(path), progress, place)
     found = [index for index, marks in enumerate(seen.landmarks) if marks is not None]
     if not found:
         raise VideoError(f"{path}: shows no face in any of its {len(seen.landmarks)} frames")
@@ -126,7 +134,7 @@ def track_video(
     )
 
 
-def _look(path: Path, progress: bool) -> _Seen:
+def _look(path: Path, progress: bool, place: PlaceLandmarks | None) -> _Seen:
     """Landmarks of all frames, and views of evenly spread key frames."""
     from uika.photo.networks import follow_meshes
     from uika.photo.orientation import turned_by
@@ -149,6 +157,8 @@ def _look(path: Path, progress: bool) -> _Seen:
         size = (image.shape[1], image.shape[0])
         if marks is not None and not keys and (degrees := turned_by(image, marks)):
             raise VideoError(f"{path}: its face is not upright; turn the video by {degrees} degrees counterclockwise")
+        if marks is not None and place is not None:
+            marks = place(image, marks)
         landmarks.append(marks)
         if marks is not None and index % stride == 0:
             keys[index] = crop_face(greys[0], marks, np.array(size) / 2, BLURS[-1][0])

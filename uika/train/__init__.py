@@ -1,9 +1,9 @@
 """Training of the reconstructor and of the correspondence estimator."""
 
 from uika.data.datasets import SYNTHETIC, Stored, Synthetic
+from uika.model.estimator_file import load_estimator
 from uika.train.config import TRAINING, LossWeights, TrainConfig
 from uika.train.dataset import Item, ItemMaker
-from uika.train.export import load_estimator
 from uika.train.loop import MODEL_FILE, Setup, TrainingError, train
 from uika.train.optimiser import batch_size, learning_rate
 from uika.train.parallel import Group, join_group, leave_group

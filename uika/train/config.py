@@ -55,7 +55,10 @@ class TrainConfig:
     texels: int = 0  # side of the atlas in training, which may be coarser than in use; 0 for the preset's
     atlas_views: int = 0  # more pictures per head that only tell the atlas's true colours
     fitted: float = 0.5  # share of heads whose correspondence comes from a landmark fit
-    augment: bool = True
+    facing: float = 0.25  # least cosine between face and camera of a photo; -1 takes every view
+    backgrounds: tuple[float, ...] = (0.0, 0.5, 1.0, 1.0)  # grey levels behind photos; in use they are white
+    estimator: str = ""  # digest of the file whose estimator finds the correspondence of photos; empty for none
+    augment: bool = True  # what cameras, files and hands do to photos, and crops
     # Optimiser
     optimizer: Literal["adamw", "adam"] = "adamw"
     learning_rate: float = 4e-4
@@ -87,6 +90,10 @@ class TrainConfig:
         for name in ("fitted", "ema"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UikaError(f"{name} must lie in [0,1], not {getattr(self, name)}")
+        if not self.backgrounds or not all(0 <= level <= 1 for level in self.backgrounds):
+            raise UikaError(f"backgrounds must be grey levels in [0,1], not {self.backgrounds}")
+        if not -1 <= self.facing <= 1:
+            raise UikaError(f"facing must lie in [-1,1], not {self.facing}")
         if self.learning_rate <= 0 or self.clip <= 0 or self.warmup < 0 or self.seed < 0:
             raise UikaError("learning_rate and clip must be positive, warmup and seed not negative")
 
@@ -131,6 +138,18 @@ TRAINING: dict[str, TrainConfig] = {
         losses=LossWeights(alpha=0.3, atlas=1.0, relief=15.0),
     ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
-    # The paper's recipe: no running mean, losses as printed.
-    "paper": TrainConfig(preset="paper", steps=150_000, ema=0.0, losses=LossWeights(alpha=0.0), **_LARGE),  # type: ignore[arg-type]
+    # The paper's recipe as printed; docs/paper.md has a row for each value.
+    "paper": TrainConfig(
+        preset="paper",
+        steps=150_000,
+        fitted=0.0,
+        facing=-1.0,
+        backgrounds=(0.0, 0.5, 1.0),
+        augment=False,
+        optimizer="adam",
+        weight_decay=0.0,
+        ema=0.0,
+        losses=LossWeights(alpha=0.0),
+        **_LARGE,  # type: ignore[arg-type]
+    ),
 }

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from uika.canonical.surface import surface_texels
 from uika.data import DataError
-from uika.data.datasets import People, Person
+from uika.data.datasets import People, Person, left_out
+from uika.data.labels import check_parameters, tracked_uv
 from uika.data.texture import true_texture
 from uika.data.views import View
 from uika.fitting import Fit, fit_photos, pixel_uv
@@ -22,9 +23,8 @@ from uika.train.augment import degrade, draw_grade
 from uika.train.config import TrainConfig
 from uika.train.sampler import Draw
 
-_MIN_FACING = 0.25  # cosine between face and camera of a photo that somebody would use
 _TRIES = 3  # people tried in the place of one that cannot be read
-_BACKGROUNDS = (0.0, 0.5, 1.0, 1.0)  # grey levels behind photos; in use they are white
+_BACKGROUNDS = (0.0, 0.5, 1.0)  # grey levels behind pictures to compare with
 _GRADE_BETWEEN = 0.15  # strength of the grades in which photos of one head differ
 _LANDMARK_BIAS, _LANDMARK_NOISE = 0.012, 0.008  # of a simulated detector, in widths of the face
 _FACE_MESH_POINTS = 478
@@ -35,7 +35,7 @@ class Item:
     """One head with V photos and D pictures of S*S pixels; M Gaussians, N vertices. Everything float32."""
 
     keys: tuple[str, ...]  # of the images it was made from
-    note: str  # what could not be read and was replaced; mostly empty
+    notes: tuple[str, ...]  # what could not be read and was replaced, or is not used; mostly empty
     images: Tensor  # [V,3,S,S] photos on one colour
     masks: Tensor  # [V,1,S,S]
     uv: Tensor  # [V,2,S,S], NaN where unknown
@@ -56,11 +56,12 @@ class Item:
     backgrounds: Tensor  # [D,3]
     texture: Tensor  # [4,A,A] true colours of the atlas and where they are known; empty if nowhere
     relief: Tensor  # [M,3] where the true surface lies, in the frame of `points`
+    driving: HeadParameters | None = None  # [D] of the pictures with the mean identity, for models on the template
 
     def to(self, device: torch.device) -> Item:
         """A copy on another device."""
         moved: dict[str, Any] = {name: v.to(device) for name, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **moved)
+        return replace(self, **moved, driving=None if self.driving is None else self.driving.to(device=device))
 
 
 class ItemMaker(torch.utils.data.Dataset[Item]):
@@ -80,20 +81,23 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         for attempt in range(_TRIES):
             person = (draw.person + attempt) % len(self._people)
             try:
-                return self._make(self._people[person], draw, " ".join(notes))
+                return self._make(self._people[person], draw, notes)
             except DataError as error:
-                notes.append(str(error))
-        raise DataError(f"{_TRIES} people in a row cannot be used; the first: {notes[0]}")
+                notes.append(f"replaced: {error}")
+        first = notes[0].removeprefix("replaced: ")
+        raise DataError(f"{_TRIES} people in a row cannot be used; the first: {first}")
 
-    def _make(self, person: Person, draw: Draw, note: str) -> Item:
+    def _make(self, person: Person, draw: Draw, replaced: list[str]) -> Item:
+        notes = (*replaced, *left_out(person))
         random = np.random.default_rng(draw.seed)
         config, head = self._config, load_head()
         extra = config.atlas_views if config.losses.atlas else 0
         wanted = config.targets + extra if config.part == "reconstructor" else 0
-        photos, pictures = _choose(person, draw.sources, wanted, config.size, random)
+        photos, pictures = _choose(person, draw.sources, wanted, config, head, random)
         for view in (*photos, *pictures):
             _check(view, head, config)
-        fitted = config.part == "reconstructor" and random.random() < config.fitted
+        on_template = config.model.canonical == "template"
+        fitted = config.part == "reconstructor" and not on_template and random.random() < config.fitted
         if config.augment:
             shared = draw_grade(random)
             for view in (*photos, *pictures):
@@ -106,7 +110,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             for view in photos:
                 view.jitter(random)
                 view.image = degrade(draw_grade(random, _GRADE_BETWEEN)(view.image), random)
-        grey = _BACKGROUNDS[random.integers(len(_BACKGROUNDS))] if config.augment else 1.0
+        grey = config.backgrounds[random.integers(len(config.backgrounds))]
         images = torch.stack([view.over(torch.full((3,), grey)) for view in photos])
         masks = torch.stack([view.mask for view in photos])
         unknown = torch.full((2, config.size, config.size), torch.nan)
@@ -114,7 +118,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         keys = tuple(view.key for view in (*photos, *pictures))
         none = torch.zeros(0)
         if config.part == "estimator":
-            return Item(keys, note, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 15)
+            return Item(keys, notes, images, masks[:, None], labels, masks[:, None], labels, *(none,) * 15)
         fit = _fit(photos, masks, head, random) if fitted else _exact(photos, head)
         uv, valid, weight = pixel_uv(fit, head, masks)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
@@ -125,10 +129,10 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
         inputs, _ = model_inputs(config.model, head, identity, fit.static_offset, images, masks, uv, weight)
         surface = inputs.surface
         posed, cameras = _poses(pictures, head, fit if fitted else None)
-        backgrounds = torch.from_numpy(random.choice(_BACKGROUNDS[:3], len(pictures))).float()[:, None].expand(-1, 3)
+        backgrounds = torch.from_numpy(random.choice(_BACKGROUNDS, len(pictures))).float()[:, None].expand(-1, 3)
         return Item(
             keys=keys,
-            note=note,
+            notes=notes,
             images=images,
             masks=masks[:, None],
             uv=uv,
@@ -149,26 +153,27 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
             backgrounds=backgrounds.contiguous(),
             texture=texture,
             relief=_relief(photos[0], head, fit, config.model.map_size) if fitted else surface.points[0],
+            driving=_driving(pictures, head) if on_template else None,
         )
 
 
 def _choose(
-    person: Person, sources: int, targets: int, size: int, random: np.random.Generator
+    person: Person, sources: int, targets: int, config: TrainConfig, head: HeadModel, random: np.random.Generator
 ) -> tuple[list[View], list[View]]:
-    """Photos that show the face, and pictures of any side; where a person has too few images, some are both."""
+    """Photos turned to the camera as far as `config.facing` asks, and pictures of any side; too few are used twice."""
     order = random.permutation(len(person))
     photos: list[View] = []
     others: list[View] = []
     for index in order.tolist():
         if len(photos) == sources and len(others) >= targets:
             break
-        view = View(person.sample(index), size)
-        (photos if len(photos) < sources and _facing(view) > _MIN_FACING else others).append(view)
+        view = View(person.sample(index), config.size, head)
+        (photos if len(photos) < sources and _facing(view) >= config.facing else others).append(view)
     if not photos:
         others.sort(key=_facing)
         photos.append(others.pop())
     pictures = others[:targets]
-    again = [View(person.sample(order[k % len(order)]), size) for k in range(targets - len(pictures))]
+    again = [View(person.sample(order[k % len(order)]), config.size, head) for k in range(targets - len(pictures))]
     return photos, [*pictures, *again]
 
 
@@ -184,15 +189,9 @@ def _facing(view: View) -> float:
 def _check(view: View, head: HeadModel, config: TrainConfig) -> None:
     if config.part == "estimator":
         if view.uv is None:
-            raise DataError(f"{view.key}: has no correspondence image, which the estimator is trained with")
+            view.uv = tracked_uv(view, head)
         return
-    if view.parameters is None:
-        raise DataError(f"{view.key}: has no head parameters")
-    sizes = (len(head.identity_basis), len(head.expression_basis), len(head.template))
-    offset = len(head.template) if view.static_offset is None else len(view.static_offset)
-    found = (len(view.parameters.identity), len(view.parameters.expression), offset)
-    if found != sizes:
-        raise DataError(f"{view.key}: made for another head model (identities, expressions, vertices: {found})")
+    check_parameters(view, head)
 
 
 def _exact(photos: list[View], head: HeadModel) -> Fit:
@@ -257,6 +256,12 @@ def _poses(pictures: list[View], head: HeadModel, fit: Fit | None) -> tuple[Tens
         posed.append(vertices)
         cameras.append(camera)
     return torch.stack(posed), Camera.stack(cameras)
+
+
+def _driving(pictures: list[View], head: HeadModel) -> HeadParameters:
+    """Expressions and poses [D] of pictures, with the mean identity."""
+    mean = torch.zeros(len(head.identity_basis))
+    return HeadParameters.stack([_parameters(view).replace(identity=mean) for view in pictures])
 
 
 def _parameters(view: View) -> HeadParameters:

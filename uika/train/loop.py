@@ -18,6 +18,8 @@ from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 from uika.metrics.lpips import Lpips
 from uika.model import computes_bfloat16
+from uika.model.dinov3 import load_backbone
+from uika.model.estimator_file import check_estimator_head, read_estimator
 from uika.train.checkpoint import Checkpoints, Progress, read_progress
 from uika.train.config import TrainConfig
 from uika.train.dataset import Item, ItemMaker
@@ -25,6 +27,7 @@ from uika.train.export import export, load_start
 from uika.train.logbook import Clock, Logbook
 from uika.train.optimiser import RunningMean, learning_rate, make_optimizer
 from uika.train.parallel import Group, Sharding, distribute
+from uika.train.requirements import backbone_of, check_start, file_digest, summary
 from uika.train.sampler import Draw, Sampler, SamplerConfig
 from uika.train.tasks import Task, blocks, judge, make_task, recompute_activations
 
@@ -43,6 +46,8 @@ class Setup:
     overfit: int = 0  # heads that every step sees, to see whether training works at all; 0 for all people
     sharding: Sharding = "ddp"
     lpips: Path | None = None
+    backbone: Path | None = None  # weights of the frozen backbone; a model to start from and a checkpoint have them
+    estimator: Path | None = None  # finds the correspondence of photos in the place of exact and fitted ones
     init: Path | None = None  # a model file whose weights a new training starts from
     progress: bool = True
 
@@ -69,17 +74,27 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
         UikaError: the run's folder holds another training, or nothing to resume.
     """
     head = load_head() if head is None else head
-    task = make_task(config, head, None if setup.lpips is None else Lpips(setup.lpips))
+    if setup.estimator is not None:
+        config = replace(config, estimator=file_digest(setup.estimator))
+    checkpoints = Checkpoints(setup.output / "checkpoints", config.keep, group)
+    latest = _latest(checkpoints, config, setup)
+    check_start(config, setup.backbone, has_weights=setup.init is not None or latest is not None)
+    estimator = None
+    if setup.estimator is not None:
+        check_estimator_head(setup.estimator, head)
+        estimator = read_estimator(setup.estimator)
+    task = make_task(config, head, None if setup.lpips is None else Lpips(setup.lpips), estimator)
     if setup.init is not None:
         load_start(task, setup.init)
+    if setup.backbone is not None:
+        load_backbone(backbone_of(task.model), setup.backbone)
     task.network.to(group.device).train()
     if config.checkpointing:
         recompute_activations(task)
     network = distribute(task.network, blocks(task.model), group, setup.sharding)
     optimizer = make_optimizer(task.network, config)
     mean = RunningMean(task.network, config.ema)
-    checkpoints = Checkpoints(setup.output / "checkpoints", config.keep, group)
-    progress = _resume(checkpoints, config, setup, task, optimizer, mean)
+    progress = Progress() if latest is None else checkpoints.load(latest, task.network, optimizer, mean)
     sampler_config = SamplerConfig(
         people=len(people),
         seed=config.seed,
@@ -92,6 +107,12 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
         sampler_config = replace(sampler_config, most_sources=1)
     sampler = Sampler(sampler_config, group.rank, group.size, progress.step, progress.cursor)
     book = Logbook(setup.output, progress.step, config.steps, setup.progress) if group.first else None
+    if book is not None:
+        files = {"backbone": setup.backbone, "estimator": setup.estimator, "lpips": setup.lpips, "init": setup.init}
+        for line in summary(config, task.model, head, files):
+            book.say(line)
+        if latest is not None:
+            book.say(f"resumed: {latest}, step {progress.step:,}")
     trainer = _Trainer(config, task, network, optimizer, mean, group, book)
     batches = _batches(ItemMaker(people, config), sampler, config.steps - progress.step, setup.workers)
     try:
@@ -99,7 +120,7 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
             progress = trainer.step(batches, progress, sampler)
             if progress.step % config.save_every == 0 or progress.step == config.steps:
                 checkpoints.save(progress, config, task.network, optimizer, mean)
-                export(setup.output / MODEL_FILE, task, mean, config, progress, group)
+                export(setup.output / MODEL_FILE, task, mean, config, progress, group, head)
     finally:
         if book is not None:
             book.close()
@@ -123,6 +144,7 @@ class _Trainer:
         self._optimizer, self._mean, self._group, self._book = optimizer, mean, group, book
         self._clock = Clock(group.device)
         self._failures = 0
+        self._said: set[str] = set()  # notes on the data
 
     def step(self, batches: Iterator[list[Item]], progress: Progress, sampler: Sampler) -> Progress:
         """Take one step; one that is not finite leaves the weights alone."""
@@ -207,22 +229,21 @@ class _Trainer:
         return nullcontext()
 
     def _note(self, items: list[Item]) -> None:
-        for item in items:
-            if item.note and self._book is not None:
-                self._book.say(f"replaced: {item.note}")
+        for note in dict.fromkeys(note for item in items for note in item.notes):
+            if note not in self._said and self._book is not None:
+                self._book.say(note)
+            self._said.add(note)
 
 
-def _resume(
-    checkpoints: Checkpoints,
-    config: TrainConfig,
-    setup: Setup,
-    task: Task,
-    optimizer: torch.optim.Optimizer,
-    mean: RunningMean,
-) -> Progress:
+def _latest(checkpoints: Checkpoints, config: TrainConfig, setup: Setup) -> Path | None:
+    """The checkpoint to go on from, if there is one and it is of this training.
+
+    Raises:
+        UikaError: the folder holds another training, or one that was not asked to go on.
+    """
     latest = checkpoints.latest()
     if latest is None:
-        return Progress()
+        return None
     if not setup.resume:
         raise UikaError(f"{setup.output}: already holds a training; add --resume to go on, or choose another folder")
     stored, wanted = read_progress(latest)["config"], json.loads(json.dumps(config.to_dict()))
@@ -231,7 +252,7 @@ def _resume(
             raise UikaError(
                 f"{latest}: was trained with {name} {stored.get(name)}, not {value}; give the same values to resume"
             )
-    return checkpoints.load(latest, task.network, optimizer, mean)
+    return latest
 
 
 def _batches(maker: ItemMaker, sampler: Sampler, steps: int, workers: int) -> Iterator[list[Item]]:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from uika.canonical.regions import regions
-from uika.canonical.surface import mirror_map
-from uika.head import HeadModel, pose_gaussians, uv_texels
+from uika.canonical.surface import canonical_binding, mirror_map
+from uika.head import HeadModel, pose_gaussians, skin_points
 from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
 from uika.train.config import TrainConfig
@@ -40,12 +40,14 @@ class Task(Protocol):
 class GaussianNetwork(nn.Module):
     """Items to Gaussians; the module that is distributed, so that its parameters are gathered on the way in."""
 
-    def __init__(self, model: Reconstructor, head: HeadModel) -> None:
-        """`head` decides the texels."""
+    def __init__(self, model: Reconstructor, head: HeadModel, estimator: Estimator | None = None) -> None:
+        """`head` decides the texels; `estimator`, which is not trained, finds the correspondence of the photos."""
         super().__init__()
         self.model = model
+        # Not a part of this module, whose parameters are distributed, counted and saved.
+        self._estimator = () if estimator is None else (estimator.eval().requires_grad_(False),)
         size = model.config.map_size
-        self._binding = uv_texels(head, size)
+        self._binding = canonical_binding(head, model.config.canonical, size)
         self._mirror, self._regions = mirror_map(head, size), regions(head, self._binding)
 
     def forward(self, items: Sequence[Item]) -> list[tuple[Tensor, ...]]:
@@ -64,21 +66,37 @@ class GaussianNetwork(nn.Module):
             item.lift,
             item.shape,
         )
-        photos = (item.images[None], item.masks[None], item.uv[None], item.weights[None])
+        photos = (item.images[None], item.masks[None], *self._located(item))
         views = self.model.encode(*photos)
         result = self.model.decode(views, self._binding.texel.to(device), surface)
         tensors = (result.means, result.quats, result.scales, result.opacities, result.colors, result.offsets)
         return tuple(tensor[0].float() for tensor in tensors)
 
+    def _located(self, item: Item) -> tuple[Tensor, Tensor]:
+        """UV maps [1,V,2,S,S] of the photos and the trust [1,V,1,S,S] in them."""
+        for estimator in self._estimator:
+            with torch.no_grad():
+                uv = estimator.to(item.images.device)(item.images[None]).float()
+            person = item.masks[None]
+            return torch.where(person > 0, uv, torch.nan), person
+        return item.uv[None], item.weights[None]
+
 
 class ReconstructionTask:
     """Photos to Gaussians, judged by pictures of them (paper section 3.4)."""
 
-    def __init__(self, config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None) -> None:
-        """A fresh model of the preset; `perceptual` takes the place of the gradient loss."""
+    def __init__(
+        self,
+        config: TrainConfig,
+        head: HeadModel,
+        perceptual: Lpips | None = None,
+        estimator: Estimator | None = None,
+    ) -> None:
+        """A fresh model of the preset; `perceptual` takes the place of the gradient loss, `estimator` that of fits."""
         self.model = build(config.model, config.seed)
-        self.network = GaussianNetwork(self.model, head)
-        self._head, self._binding = head, uv_texels(head, self.model.config.map_size)
+        self.network = GaussianNetwork(self.model, head, estimator)
+        self._head = head
+        self._binding = canonical_binding(head, config.model.canonical, self.model.config.map_size)
         self._losses, self._perceptual = config.losses, perceptual
 
     def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
@@ -121,16 +139,21 @@ class ReconstructionTask:
         images: list[Tensor | None] = [None] * len(item.pictures)
         alphas: list[Tensor | None] = [None] * len(item.pictures)
         for group in _same_poses(item.posed):
-            placed = pose_gaussians(
-                means,
-                quats,
-                scales,
-                item.canonical,
-                item.posed[group[0]],
-                self._head.faces.to(device),
-                binding.triangle.to(device),
-                binding.barycentric.to(device),
-            )
+            if item.driving is None:
+                placed = pose_gaussians(
+                    means,
+                    quats,
+                    scales,
+                    item.canonical,
+                    item.posed[group[0]],
+                    self._head.faces.to(device),
+                    binding.triangle.to(device),
+                    binding.barycentric.to(device),
+                )
+            else:
+                self._head, self._binding = self._head.to(device=device), self._binding.to(device)
+                centres = skin_points(means, self._head, item.driving[group[0]], self._binding)
+                placed = (centres, quats, scales)
             size = item.pictures.shape[-1]
             cameras = (item.viewmats[group], item.Ks[group])
             seen, coverage, _ = rasterization(
@@ -214,11 +237,13 @@ def judge(task: Task, output: Sequence[Tensor], item: Item) -> Judgement:
     return Judgement(loss, {name: float(value.detach()) for name, value in terms.items()})
 
 
-def make_task(config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None) -> Task:
+def make_task(
+    config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None, estimator: Estimator | None = None
+) -> Task:
     """The task of a config."""
     if config.part == "estimator":
         return EstimatorTask(config)
-    return ReconstructionTask(config, head, perceptual)
+    return ReconstructionTask(config, head, perceptual, estimator)
 
 
 def recompute_activations(task: Task) -> None:

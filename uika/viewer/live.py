@@ -66,18 +66,18 @@ class LiveSplats:
 
     def pose(self, params: HeadParameters) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
         """The buffer [N,8] and the mesh [V,3] of one pose, in the page's units."""
-        vertices, turn = self._renderer.meshes(_many(params))
-        posed = self._renderer.rig.pose(vertices[0], turn[0])
+        (mesh,) = self._renderer.meshes(_many(params))
+        posed = self._renderer.gaussians(mesh)
         count = len(self.avatar)
         covariances = _covariances(posed, count).numpy().reshape(count, 6)
         np.multiply(posed.means.numpy().reshape(count, 3), np.float32(UNITS), out=self._buffer[:, :3].view(np.float32))
         self._buffer[:, 4:7] = covariances.view(np.uint32)
-        return self._buffer.copy(), vertices[0].numpy() * np.float32(UNITS)
+        return self._buffer.copy(), mesh.vertices.numpy() * np.float32(UNITS)
 
     def draw(self, params: HeadParameters, camera: Camera) -> NDArray[np.uint8]:
         """The picture [H,W,3] of one pose, by the rasterizer, in the colours that are shown."""
-        vertices, turn = self._renderer.meshes(_many(params))
-        return self._renderer.blend(self._renderer.project(vertices[0], turn[0], camera)).numpy()
+        (mesh,) = self._renderer.meshes(_many(params))
+        return self._renderer.blend(self._renderer.project(mesh, camera)).numpy()
 
 
 def _many(params: HeadParameters) -> HeadParameters:

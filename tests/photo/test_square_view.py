@@ -4,9 +4,8 @@ import torch
 from safetensors.torch import load_file
 
 from tests.heads import PARITY
-from uika.data import prepare_reference, prepare_view, reference_box
-from uika.data.prepare import area_resize
 from uika.errors import UikaError
+from uika.photo.square_view import area_resize, prepare_reference, prepare_view, reference_box
 
 FIXTURE = PARITY / "image_prep.safetensors"
 
