@@ -13,15 +13,15 @@ from uika.errors import UikaError
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score avatars against held-out frames, in the paper's settings; the report gathers all runs in its folder.
+    """Score avatars against held-out frames, in the paper's settings.
 
-    Run the same command again to go on after an interruption. Example: uika evaluate --data people -o report
+    Run it again to go on. Example: uika evaluate --data people -o report
     """
 
     data: Path
-    """A folder with captures or shards, such as `uika synthesize` makes."""
+    """A folder with captures or shards."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("report")
-    """The report's folder."""
+    """The report's folder, which gathers all runs."""
     setting: Literal["mono", "multi", "both"] = "mono"
     """Frames of one camera, or of several."""
     task: Literal["self", "cross", "both"] = "self"
@@ -29,7 +29,7 @@ class Evaluate:
     views: str = "1,2,4,8,16"
     """Numbers of source frames, with commas."""
     model: str = "tiny"
-    """tiny, none, or a trained or released model file."""
+    """tiny, none, or a trained or released file."""
     estimator: Annotated[Path | None, arg(metavar="PATH")] = None
     """Correspondence estimator for the sources."""
     backbone: Annotated[Path | None, arg(metavar="PATH")] = None

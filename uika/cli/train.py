@@ -24,7 +24,7 @@ class Train:
     output: Annotated[Path, arg(aliases=["-o"])]
     """The run's folder, with the model in the end."""
     data: tuple[str, ...] = ("synthetic",)
-    """Folders of captures or shards, or "synthetic" people."""
+    """Folders of people, or "synthetic" ones."""
     preset: Literal["tiny", "base", "paper"] = "tiny"
     """Size of the network, and its training."""
     part: Literal["reconstructor", "estimator"] = "reconstructor"
@@ -51,16 +51,16 @@ class Train:
     """Photos per step and process."""
     size: int | None = None
     """Side of photos and pictures in pixels."""
-    save_every: int | None = None
+    save_every: Annotated[int | None, arg(metavar="INT")] = None
     """Steps from one checkpoint to the next."""
     init: Path | None = None
-    """A model of the same architecture to start from."""
+    """A model of the same kind to start from."""
     lpips: Path | None = None
-    """LPIPS weights, else gradients are compared."""
+    """LPIPS weights, else gradients."""
     backbone: Annotated[Path | None, arg(metavar="PATH")] = None
-    """DINOv3 weights, which base and paper need."""
+    """DINOv3 weights, for base and paper."""
     estimator: Annotated[Path | None, arg(metavar="PATH")] = None
-    """Finds the photos' UVs, else the data tells."""
+    """Finds the photos' UV coordinates."""
 
     def run(self) -> int:
         """Train."""
