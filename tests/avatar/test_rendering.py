@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import av
 import pytest
 import torch
@@ -15,6 +17,7 @@ from uika import (
 )
 from uika.avatar.rendering import motion_cameras
 from uika.cli.contact_sheet import contact_sheet
+from uika.errors import UikaWarning
 from uika.io.video import to_bytes
 
 SIZE = 96
@@ -142,3 +145,24 @@ def test_contact_sheet_places_pictures_and_labels():
     torch.testing.assert_close(sheet[20, 60], colors[1])
     torch.testing.assert_close(sheet[row + 20, 20], colors[2])
     assert sheet[41:row, :40].min() < 0.5 and sheet[row:, 40:].min() == 1
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 3.0), (1.0, 0.0, 0.0), (0.0, -0.8, 0.0), (0.0, 0.0, 40.0)])
+def test_a_translation_out_of_the_picture_is_spoken_of(avatar, head, shift):
+    still = get_motion("talk", head, 10.0)
+    assert len(motion_cameras(avatar, still, SIZE).viewmat) == len(still)
+    away = torch.zeros(len(still), 3)
+    away[5:] = torch.tensor(shift)
+    moved = replace(still, translation=away)
+    if shift[2] > 20:  # behind the camera
+        assert float(neutral_camera(avatar, size=SIZE).position[2]) < 40
+    with pytest.warns(
+        UikaWarning, match=rf"out of the picture in {len(still) - 5} of {len(still)} frames, first in .* 5;"
+    ):
+        motion_cameras(avatar, moved, SIZE)
+
+
+@pytest.mark.parametrize("shift", [(0.02, 0.0, 0.0), (0.0, 0.03, -0.1), (0.0, 0.0, -2.0)])
+def test_small_translations_are_nothing_to_speak_of(avatar, head, shift):
+    still = get_motion("talk", head, 10.0)
+    motion_cameras(avatar, replace(still, translation=torch.tensor(shift).expand(len(still), 3)), SIZE)

@@ -63,7 +63,9 @@ def test_import_command_makes_a_head_that_fits(tmp_path: Path, capsys: pytest.Ca
     model, mesh = write_pickle(tmp_path / "flame2023.pkl", arrays), write_obj(tmp_path / "flame.obj", arrays)
     output = tmp_path / "flame.npz"
     assert main(["head", "import", str(model), "--obj", str(mesh), "-o", str(output)]) == 0
-    assert "5,023 vertices" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "5,023 vertices" in said.out
+    assert [line.split()[0] for line in said.err.splitlines()] == ["reading", "finding", "marking", "writing"]
     head = load_head(output)
     assert fitted_joints(head) == (2, 3, 4)
     marks = torch.full((1, 478, 2), 256.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.errors import UikaError
+from uika.errors import UikaError, UikaWarning
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at
 from uika.io.progress import counted
 from uika.motion import Motion
@@ -123,7 +124,10 @@ def neutral_camera(avatar: Avatar, yaw: float = 0.0, pitch: float = 0.0, size: i
 
 
 def motion_cameras(avatar: Avatar, motion: Motion, size: int = 512) -> Camera:
-    """The cameras [T] of a motion: `neutral_camera` along the motion's path, or from the front where it has none."""
+    """The cameras [T] of a motion: `neutral_camera` along the motion's path, or from the front where it has none.
+
+    Warns (`UikaWarning`) of a motion whose translation takes the head out of their pictures.
+    """
     rest = torch.zeros(len(motion))
     yaw = rest if motion.yaw is None else motion.yaw
     pitch = rest if motion.pitch is None else motion.pitch
@@ -132,7 +136,24 @@ def motion_cameras(avatar: Avatar, motion: Motion, size: int = 512) -> Camera:
     for view in zip(yaw.tolist(), pitch.tolist(), strict=True):
         if view not in seen:
             seen[view] = _view(frame, *view, size)
-    return Camera.stack([seen[view] for view in zip(yaw.tolist(), pitch.tolist(), strict=True)])
+    path = Camera.stack([seen[view] for view in zip(yaw.tolist(), pitch.tolist(), strict=True)])
+    _warn_of_absence(frame[0] + motion.translation, path)
+    return path
+
+
+def _warn_of_absence(centres: Tensor, path: Camera) -> None:
+    """Say so if the head's centre [T,3] lies outside the pictures of T cameras."""
+    seen = torch.einsum("tij,tj->ti", path.viewmat[:, :3, :3], centres) + path.viewmat[:, :3, 3]
+    place = torch.einsum("tij,tj->ti", path.K, seen)
+    inside = (place[:, :2] >= 0) & (place[:, :2] <= place[:, 2:] * torch.tensor([path.width, path.height]))
+    absent = (~(inside.all(-1) & (seen[:, 2] > 0))).nonzero()[:, 0].tolist()
+    if absent:
+        warnings.warn(
+            f"the motion's translation takes the head out of the picture in {len(absent)} of {len(centres)} frames, "
+            f"first in frame {absent[0]}; translations are metres from the head's place at rest",
+            UikaWarning,
+            stacklevel=3,
+        )
 
 
 def _frame(avatar: Avatar) -> tuple[Tensor, float]:

@@ -36,8 +36,10 @@ class ImportHead:
         """Read, embed landmarks, save."""
         target = check_output(self.output, ".npz")
         from uika.head_import import import_flame
+        from uika.io.progress import steps
 
-        head = import_flame(self.model, target, self.obj, self.masks, self.eyelids)
+        with steps() as say:
+            head = import_flame(self.model, target, self.obj, self.masks, self.eyelids, say)
         print(f"wrote {target}: {_summary(head)}")
         return 0
 

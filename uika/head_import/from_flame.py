@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,19 +28,29 @@ _FLAME_MASKS = {
 }
 
 
-def adopt(head: HeadModel) -> HeadModel:
+def _silent(step: str) -> None:
+    """Tell nobody."""
+
+
+def adopt(head: HeadModel, say: Callable[[str], None] = _silent) -> HeadModel:
     """A copy of `head` with embedded landmarks and region masks.
 
     The face mesh detector looks at pictures of the painted mean head, so the result depends on nothing but the head.
 
+    Args:
+        head: the bare head.
+        say: told what is being done.
+
     Raises:
         HeadError: no face is found on it.
     """
+    say("finding landmarks")
     skin = (eyeballs(head) > 0) | (head.lbs_weights[:, :3].sum(-1) > 0.5)
     ids, triangles, mix, trust = embed(head, paint(head), skin[head.faces].all(-1))
     marked = replace(
         head, landmark_ids=ids, landmark_faces=triangles, landmark_barycentrics=mix, landmark_weights=trust
     )
+    say("marking regions")
     return replace(marked, masks=region_masks(marked))
 
 
@@ -50,6 +60,7 @@ def import_flame(
     obj: str | Path | None = None,
     masks: str | Path | None = None,
     eyelids: Sequence[str | Path] = (),
+    say: Callable[[str], None] = _silent,
 ) -> HeadModel:
     """Convert a FLAME model file to a head file for `--head` or `UIKA_HEAD`.
 
@@ -59,16 +70,19 @@ def import_flame(
         obj: Wavefront file with the texture coordinates.
         masks: FLAME's masks file (a pickle of index lists), used instead of the masks found from the geometry.
         eyelids: two `.npy` files with the displacement of shut lids, left and right.
+        say: told what is being done, step by step.
 
     Raises:
         HeadError: a file cannot be used; the message names it.
         UikaError: the output cannot be written.
     """
     target = check_output(output, ".npz")
+    say(f"reading {path}")
     head = read_flame(path, obj, eyelids)
     given = {} if masks is None else _read_masks(Path(masks), len(head.template))
-    head = adopt(head)
+    head = adopt(head, say)
     head = replace(head, masks={**head.masks, **given})
+    say(f"writing {target}")
     with replacing(target) as temporary:
         save_head(head, temporary)
     return head

@@ -65,8 +65,17 @@ def embed(head: HeadModel, colours: Tensor, keep: Tensor) -> tuple[Tensor, Tenso
 
 def nearest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 64) -> tuple[Tensor, Tensor, Tensor]:
     """Closest place on a mesh to each point [N,3]: triangle [N], barycentrics [N,3] and distance [N] in metres."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    results = [_nearest(part[:, None], a, b, c) for part in points.split(chunk)]
+    corners = vertices[faces]  # [F,3,3]
+    middles = corners.mean(1)
+    reach = (corners - middles[:, None]).norm(dim=-1).amax(1)
+    results = []
+    for part in points.split(chunk):
+        away = (part[:, None] - middles).norm(dim=-1)
+        # A triangle no part of which can be closer than another's middle need not be looked at.
+        close = away - reach <= away.amin(1, keepdim=True) + 1e-6
+        order = close.to(torch.int8).topk(int(close.sum(1).max()), dim=1).indices.sort(dim=1).values
+        triangle, mix, distance = _nearest(part[:, None], *corners[order].unbind(2))
+        results.append((order.gather(1, triangle[:, None])[:, 0], mix, distance))
     triangle, mix, distance = (torch.cat(parts) for parts in zip(*results, strict=True))
     return triangle, mix, distance
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from uika.head import HeadModel, look_at, project, rasterize, vertex_normals
-from uika.head.face_paint import SIZE, eyeballs, mouth_slit
+from uika.head.face_paint import eyeballs, mouth_slit
 
 # Outlines in the 478-point face mesh.
 FACE_OVAL = (
@@ -23,6 +25,7 @@ CHIN, NOSE_BASE, BROWS = 152, 2, (105, 334)
 EAR_REACH = 0.045  # metres around the outermost vertex
 EAR_RELIEF = 0.0035  # metres that an ear stands out of the smoothed head
 MOUTH_REACH = 0.06  # metres behind the lips
+LOOK_SIZE = 160  # pixels over that reach on both sides, 0.8 mm each
 VIEWS = tuple((yaw, pitch) for yaw in range(-180, 180, 30) for pitch in (-40, 0, 40))
 
 
@@ -119,20 +122,21 @@ def _inner_mouth(head: HeadModel, marks: dict[int, Tensor], balls: Tensor) -> Te
     slit = mouth_slit(head)
     near = (head.template - slit).norm(dim=-1) < MOUTH_REACH
     top = marks[NOSE_BASE][1] if NOSE_BASE in marks else slit[1] + 0.02
-    hidden = near & ~balls & ~_visible(head) & (head.template[:, 2] < slit[2]) & (head.template[:, 1] < top)
+    hidden = near & ~balls & ~_visible(head, slit) & (head.template[:, 2] < slit[2]) & (head.template[:, 1] < top)
     return hidden
 
 
-def _visible(head: HeadModel) -> Tensor:
-    """Vertices [V] of triangles that some camera around the head sees."""
+def _visible(head: HeadModel, centre: Tensor) -> Tensor:
+    """Vertices [V] of triangles within `MOUTH_REACH` of the centre [3] that some camera around the head sees."""
     seen = torch.zeros(len(head.template), dtype=torch.bool)
     middle = (head.template.amin(0) + head.template.amax(0)) / 2
     radius = float((head.template - middle).norm(dim=-1).max())
+    field = 2 * math.degrees(math.atan(1.1 * MOUTH_REACH / (4 * radius)))
     facing = normalize(vertex_normals(head.template, head.faces), dim=-1)
     for yaw, pitch in VIEWS:
-        camera = look_at(yaw, pitch, 4 * radius, middle, fov_y=30.0, size=SIZE)
+        camera = look_at(yaw, pitch, 4 * radius, centre, fov_y=field, size=LOOK_SIZE)
         points, depth = project(head.template, camera)
-        triangle, _ = rasterize(points, head.faces, SIZE, SIZE, depth=depth)
+        triangle, _ = rasterize(points, head.faces, LOOK_SIZE, LOOK_SIZE, depth=depth)
         hit = head.faces[triangle[triangle >= 0].unique()].unique()
         towards = (facing[hit] * (camera.position - head.template[hit])).sum(-1) > 0
         seen[hit[towards]] = True
