@@ -17,6 +17,7 @@ from ._backend import (
     Backend,
     bits_of,
     exp2,
+    larger,
     packet,
     power_of_two,
     recorded,
@@ -141,6 +142,10 @@ def step(be: Backend, alpha: Any, transmittance: Any, settings: Settings) -> tup
     """Whether the pair is blended, its weight, and the transmittance behind it (negated once the pixel has stopped)."""
     after = dr.fma(-alpha, transmittance, transmittance)
     alive = after > settings.options.transmittance_min
+    if settings.closing:
+        # A pixel that stops here has a positive transmittance left; one that has stopped before has the negative zero.
+        rest = larger(transmittance, 0.0)
+        return alive, dr.select(alive, alpha * transmittance, rest), dr.select(alive, after, -0.0)
     stopped = dr.reinterpret_array(be.plain.Float, bits_of(be, transmittance) | SIGN)
     return alive, dr.select(alive, alpha * transmittance, 0.0), dr.select(alive, after, stopped)
 

@@ -75,6 +75,7 @@ class Settings:
     semantics: str = "gsplat"
     options: Options = field(default_factory=Options)
     camera_model: str = "pinhole"
+    closing: bool = False  # the splat at which a pixel stops gets all that is left; the adjoint knows nothing of it
 
     @classmethod
     def of(cls, width: Any, height: Any, options: Options | None = None, **arguments: Any) -> Settings:
@@ -84,7 +85,7 @@ class Settings:
             ValueError: a value is not allowed.
             TypeError: a name is not that of a field.
         """
-        unknown = set(arguments) - {f.name for f in fields(cls)}
+        unknown = set(arguments) - {f.name for f in fields(cls)} | {"closing"} & set(arguments)
         if unknown:
             raise TypeError(f"got an unexpected keyword argument {min(unknown)!r}")
         width, height = _integer("width", width), _integer("height", height)

@@ -31,6 +31,10 @@ EIGENVALUE_FLOOR_INRIA = 0.1
 T_MIN = 1e-4
 """Blending stops before the splat that would bring the transmittance to this value or below."""
 
+T_CLOSING = 1.0 / 255.0
+"""The same for pictures in bytes, where the splat at which a pixel stops gets all that is left of its transmittance: no
+channel is off by more than this times the contrast of what lies behind."""
+
 FRUSTUM_MARGIN = 0.3
 """Share of tan(field of view / 2) beyond the image at which x/z and y/z are clamped inside the projection's
 Jacobian (1.3 tan in all); further out the affine approximation would smear one splat over the whole image."""

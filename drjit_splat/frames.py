@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +17,7 @@ from ._binning import TileLists, build, empty
 from ._blend import accumulate
 from ._project import Arrays, Queued
 from ._settings import Options, Settings
+from .constants import T_CLOSING
 from .profiling import stage
 
 CHANNELS = 3
@@ -86,6 +87,7 @@ def project_frame(
     intrinsics: Any,
     width: int,
     height: int,
+    closing: float = T_CLOSING,
 ) -> ProjectedFrame:
     """Begin to project N >= 1 splats, for a picture as `rasterization` makes it, rounded to bytes.
 
@@ -102,12 +104,19 @@ def project_frame(
         intrinsics: [9].
         width: pixels.
         height: pixels.
+        closing: transmittance at which a pixel is closed: the splat that would bring it down to this gets all that is
+            left, and what lies behind is skipped. A channel, in [0, 1], is off by at most `closing` times the largest
+            difference of colours. 0 stops as `rasterization` does.
 
     Raises:
+        ValueError: `closing` is not in [0, 1).
         RuntimeError: no LLVM library was found; the message says what to install.
     """
     be = backend_named(True)
-    settings = Settings(width, height, options=OPTIONS)
+    if not 0 <= closing < 1:
+        raise ValueError(f"closing must lie in [0, 1), not {closing}")
+    options = replace(OPTIONS, transmittance_min=closing) if closing else OPTIONS
+    settings = Settings(width, height, options=options, closing=closing > 0)
     settings.check()
     project = _projection(be, dr.width(opacities), settings)
     with stage("project"):

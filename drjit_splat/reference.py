@@ -168,6 +168,9 @@ def blend(
     else:
         keep = decisions.keep
     alpha = torch.where(keep, alpha, torch.zeros_like(alpha))
+    if settings.closing and decisions is None:
+        stops = hit & (after <= t_min)
+        alpha = torch.where(stops & (torch.cumsum(stops, 0) == 1), torch.ones_like(alpha), alpha)
     log_after = torch.cumsum(torch.log1p(-alpha), 0)
     before = torch.cat([torch.zeros_like(log_after[:1]), log_after[:-1]]).exp()
     sums = (alpha * before).T @ features[order]
@@ -230,22 +233,16 @@ def rasterization(
     double = given.to(torch.float64)
     batches = double.batches(settings)
     orders = [None] * len(batches) if order is None else order.reshape(len(batches), -1, means.shape[-2])
-    first = (
-        [None] * len(batches)
-        if decisions is None
-        else [
-            decisions[b * len(decisions) // len(batches) :][: len(decisions) // len(batches)]
-            for b in range(len(batches))
-        ]
-    )
-    found = [_images(s, settings, o, d) for s, o, d in zip(batches, orders, first, strict=True)]
+    cameras = len(decisions or ()) // len(batches)
+    first = [decisions and decisions[b * cameras :][:cameras] for b in range(len(batches))]
+    found = [images(s, settings, o, d) for s, o, d in zip(batches, orders, first, strict=True)]
     if not given.batch:
         return found[0]
     colors_, alphas, metas = zip(*found, strict=True)
     return _stacked(colors_, given), _stacked(alphas, given), _batched(metas, given)
 
 
-def _images(
+def images(
     splats: Splats, settings: Settings, order: Tensor | None, decisions: list[Decisions] | None
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Images of all cameras, without batch dimensions."""

@@ -27,10 +27,17 @@ def _moving(head: HeadModel, count: int) -> Motion:
     )
 
 
+def test_closed_pixels_are_off_by_a_level_at_most(head: HeadModel, avatar: Avatar) -> None:
+    motion = _moving(head, 2)
+    quick, whole = (list(film(avatar, motion, head=head, size=SIZE, closing=closing)) for closing in (None, 0))
+    for one, other in zip(quick, whole, strict=True):
+        assert np.abs(one.astype(int) - other).max() <= 1
+
+
 def test_bytes_are_those_of_the_differentiable_way(head: HeadModel, avatar: Avatar) -> None:
     motion = _moving(head, 18)
     background = (0.2, 0.4, 0.6)
-    pictures = list(film(avatar, motion, head=head, background=background, size=SIZE))
+    pictures = list(film(avatar, motion, head=head, background=background, size=SIZE, closing=0))
     assert len(pictures) == 18
     for picture, frame in zip(pictures, frames(avatar, motion, None, head, background, size=SIZE), strict=True):
         assert picture.shape == (SIZE, SIZE, 3) and picture.dtype == np.uint8

@@ -38,8 +38,14 @@ _BLOCK = 16  # frames whose meshes are posed together: one product of matrices i
 class FrameRenderer:
     """An avatar ready to be filmed: its Gaussians, their binding and its own head, prepared once."""
 
-    def __init__(self, avatar: Avatar, head: HeadModel, background: Sequence[float] = (1.0, 1.0, 1.0)) -> None:
-        """Prepare.
+    def __init__(
+        self,
+        avatar: Avatar,
+        head: HeadModel,
+        background: Sequence[float] = (1.0, 1.0, 1.0),
+        closing: float | None = None,
+    ) -> None:
+        """Prepare; `closing` as in `drjit_splat.frames.project_frame`, None for its default.
 
         Raises:
             AvatarError: the head model is not the avatar's.
@@ -61,6 +67,7 @@ class FrameRenderer:
         self._avatar, self._own_head = avatar, head
         self._still = (_flat(avatar.quats), _flat(avatar.scales))
         self._opacities, self._colors = _flat(avatar.opacities), _flat(avatar.colors)
+        self._closing = {} if closing is None else {"closing": closing}
         self._background = _flat(torch.tensor(list(background)))
 
     @torch.no_grad()
@@ -87,7 +94,8 @@ class FrameRenderer:
 
         posed = self.gaussians(mesh)
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
-        return project_frame(*posed, self._opacities, self._colors, view, intrinsics, camera.width, camera.height)
+        size = camera.width, camera.height
+        return project_frame(*posed, self._opacities, self._colors, view, intrinsics, *size, **self._closing)
 
     def blend(self, projected: ProjectedFrame, last: Frame | None = None) -> Frame:
         """Wait for a frame's projection and queue the rest; quicker with the `last` frame of the film."""
@@ -102,6 +110,7 @@ def film(
     background: Sequence[float] = (1.0, 1.0, 1.0),
     *,
     size: int = 512,
+    closing: float | None = None,
     progress: bool = False,
 ) -> Iterator[NDArray[np.uint8]]:
     """Render a motion frame by frame as bytes; what `frames` renders, without alpha and gradients.
@@ -116,6 +125,7 @@ def film(
         head: the head model; None loads the one that `uika.head.load_head` finds.
         background: sRGB in [0,1].
         size: side of the picture in pixels when `cameras` is None.
+        closing: transmittance at which a pixel is closed; None is one grey level at most, 0 leaves nothing out.
         progress: whether to show a progress bar on stderr.
 
     Yields:
@@ -126,7 +136,7 @@ def film(
         RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
     """
     model = load_head() if head is None else head
-    renderer = FrameRenderer(avatar, model, background)
+    renderer = FrameRenderer(avatar, model, background, closing)
     path = motion_cameras(avatar, motion, size) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
     frame: Frame | None = None
