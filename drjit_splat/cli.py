@@ -1,4 +1,4 @@
-"""The command `drjit-splat`: a picture of a splat file."""
+"""The command `drjit-splat`: a picture of a splat file, or a scene trained from photos."""
 
 from __future__ import annotations
 
@@ -49,9 +49,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         arguments = _parser().parse_args(argv)
-        return _render(arguments)
+        return int(arguments.run(arguments))
     except SystemExit as end:
         return int(end.code or 0)
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        return 130
     except (ValueError, OSError, RuntimeError, ModuleNotFoundError) as error:
         print(f"drjit-splat: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -187,7 +190,9 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    about = f"Render 3D Gaussian splats with Dr.Jit. {_EXAMPLE}"
+    from .training.command import add_parser as add_training
+
+    about = f"Render and train 3D Gaussian splats with Dr.Jit. {_EXAMPLE}"
     parser = argparse.ArgumentParser("drjit-splat", description=about)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     render = commands.add_parser("render", help="render a splat .ply file", description=_EXAMPLE)
@@ -199,8 +204,10 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--pitch", type=float, default=0.0, help="degrees, without --camera; positive: from above")
     render.add_argument("--size", type=int, default=800, help="pixels, without --camera (default: %(default)s)")
     render.add_argument("--y-up", action="store_true", help="without --camera: +Y points up, not down")
+    render.set_defaults(run=_render)
     colors = {"type": float, "nargs": 3, "metavar": ("R", "G", "B"), "default": [1.0, 1.0, 1.0]}
     render.add_argument("--background", help="in [0,1] (default: white)", **colors)  # type: ignore[arg-type]
+    add_training(commands)
     return parser
 
 

@@ -56,14 +56,21 @@ class SplatFile:
 
 
 @dataclass(frozen=True)
-class _Header:
+class Header:
+    """What the first lines of a `.ply` say of its vertices."""
+
     count: int  # vertices
     properties: list[tuple[str, str]]  # name and numpy type
     kind: str  # one of _KINDS
     length: int  # bytes before the first vertex
 
 
-def _read_header(path: Path) -> _Header:
+def read_header(path: Path) -> Header:
+    """Read a file's first lines.
+
+    Raises:
+        ValueError: they are those of no `.ply` file that can be read; the message names it.
+    """
     with path.open("rb") as file:
         start = file.read(_HEADER_LIMIT)
     marker = start.find(b"end_header")
@@ -88,11 +95,15 @@ def _read_header(path: Path) -> _Header:
             properties.append((line[2], _TYPES[line[1]]))
     if len({name for name, _ in properties}) != len(properties):
         raise ValueError(f"{path} names a property twice")
-    return _Header(int(first[-1]), properties, kind, end)
+    return Header(int(first[-1]), properties, kind, end)
 
 
-def _read_rows(path: Path, header: _Header) -> NDArray[np.void]:
-    """One record for each vertex."""
+def read_rows(path: Path, header: Header) -> NDArray[np.void]:
+    """One record for each vertex.
+
+    Raises:
+        ValueError: the file is cut short or damaged; the message names it.
+    """
     layout = np.dtype(header.properties)
     if header.kind == "ascii":
         return _read_text(path, header, layout)
@@ -103,7 +114,7 @@ def _read_rows(path: Path, header: _Header) -> NDArray[np.void]:
     return np.fromfile(path, stored, header.count, offset=header.length)
 
 
-def _read_text(path: Path, header: _Header, layout: np.dtype[np.void]) -> NDArray[np.void]:
+def _read_text(path: Path, header: Header, layout: np.dtype[np.void]) -> NDArray[np.void]:
     with path.open("rb") as file:
         file.seek(header.length)
         words = file.read().split()
@@ -125,7 +136,7 @@ def load_ply(path: str | os.PathLike[str]) -> SplatFile:
         ValueError: the file is no splat file, is cut short, or holds a NaN or an infinity.
     """
     path = Path(path)
-    header = _read_header(path)
+    header = read_header(path)
     count, names = header.count, [name for name, _ in header.properties]
     missing = [name for name in (*_NEEDED, *_QUAT) if name not in names]
     if missing:
@@ -133,7 +144,7 @@ def load_ply(path: str | os.PathLike[str]) -> SplatFile:
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise ValueError(f"{path} has {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
-    table = _read_rows(path, header)
+    table = read_rows(path, header)
 
     def columns(*chosen: str) -> Tensor:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in chosen], -1))

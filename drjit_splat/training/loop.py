@@ -1,0 +1,239 @@
+"""Train the splats of a scene, one photo a step; a run goes on exactly where it was stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..rasterizer import rasterization
+from ..strategy import DefaultStrategy, MCMCStrategy
+from . import checkpoint, corrections, gaussians
+from .captures import Capture, Photo
+from .config import TrainConfig
+from .similarity import psnr, ssim
+
+SPLATS, LOG, FIGURES = "splats.ply", "log.jsonl", "evaluation.json"
+_LOG_EVERY = 50
+_SCALE_WEIGHT = _OPACITY_WEIGHT = 0.01  # of the means of scales and opacities, as MCMC wants them
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a run is."""
+
+    step: int  # done
+    loss: float
+    psnr: float
+    splats: int
+    seconds: float
+
+
+def train(
+    capture: Capture,
+    output: str | Path,
+    config: TrainConfig | None = None,
+    *,
+    watch: Callable[[Progress, dict[str, torch.nn.Parameter]], None] | None = None,
+) -> dict[str, Any]:
+    """Train, evaluate on the held-out photos and write `splats.ply`, `evaluation.json`, `log.jsonl` and checkpoints.
+
+    A folder with a checkpoint of the same settings is gone on with; its losses are those of a run that never stopped.
+
+    Args:
+        capture: the photos.
+        output: the run's folder; made if it is missing.
+        config: settings; None takes the defaults.
+        watch: called after every step.
+
+    Returns:
+        The figures of `evaluation.json`: PSNR and SSIM of each held-out photo and their means, splats, steps, seconds.
+
+    Raises:
+        ValueError: a photo or the checkpoint cannot be used, the checkpoint has other settings, or the loss is no
+            longer finite; the last good checkpoint stays.
+    """
+    config = config or TrainConfig()
+    config.check()
+    folder = Path(output)
+    folder.mkdir(parents=True, exist_ok=True)
+    run = _Run(capture, config, checkpoint.load(folder))
+    begun = time.perf_counter() - run.seconds
+    while run.step < config.steps:
+        progress = run.advance(time.perf_counter() - begun)
+        if not math.isfinite(progress.loss):
+            raise ValueError(
+                f"{folder}: the loss is no longer finite at step {progress.step}; the last checkpoint is kept"
+            )
+        if progress.step % _LOG_EVERY == 0 or progress.step == config.steps:
+            with (folder / LOG).open("a") as file:
+                file.write(json.dumps(vars(progress)) + "\n")
+        if progress.step % config.checkpoint_every == 0 or progress.step == config.steps:
+            run.seconds = progress.seconds
+            checkpoint.save(folder, run.checkpoint())
+        if watch is not None:
+            watch(progress, run.params)
+    gaussians.write(run.params, folder / SPLATS)
+    figures = run.evaluate() | {"steps": run.step, "splats": len(run.params["means"]), "seconds": run.seconds}
+    (folder / FIGURES).write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+class _Run:
+    """The state of a run."""
+
+    def __init__(self, capture: Capture, config: TrainConfig, known: checkpoint.Checkpoint | None) -> None:
+        if known is not None and known.config != config:
+            raise ValueError(
+                "the run's folder has a checkpoint of other settings; go on with the same or take another folder"
+            )
+        self.capture, self.config, self.extent = capture, config, capture.extent
+        self.params = gaussians.start(capture, config)
+        self.corrections = corrections.start(len(capture.photos), config)
+        self.strategy = _strategy(config)
+        self.state: dict[str, Any] = (
+            self.strategy.initialize_state()
+            if isinstance(self.strategy, MCMCStrategy)
+            else self.strategy.initialize_state(self.extent)
+        )
+        self.step, self.seconds = 0, 0.0
+        tensors: dict[str, Tensor] = {}
+        if known is not None:
+            self.step, self.seconds, tensors = known.step, known.seconds, known.tensors
+            for name in self.params:
+                self.params[name] = torch.nn.Parameter(tensors[f"param/{name}"])
+            for name in self.corrections:
+                self.corrections[name] = torch.nn.Parameter(tensors[f"param/{name}"])
+            self.state |= {key.removeprefix("state/"): v for key, v in tensors.items() if key.startswith("state/")}
+        self.optimizers = gaussians.optimizers(self.params, self.extent)
+        self.correcting = corrections.optimizers(self.corrections)
+        checkpoint.restore_optimizers({**self.optimizers, **self.correcting}, tensors)
+        self._pictures: dict[tuple[int, int], Tensor] = {}
+
+    def advance(self, seconds: float) -> Progress:
+        """One step."""
+        # Everything that is drawn depends on the step alone, so that a run can be stopped anywhere.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.seed * 1_000_003 + self.step)
+            rate = gaussians.set_rate(self.optimizers, self.extent, self.step, self.config.steps)
+            index = self._photo()
+            photo = self.capture.photos[index]
+            shrink = self.config.shrink(self.step, min(photo.width, photo.height))
+            background = torch.rand(3) if self.config.random_background else torch.ones(3)
+            wanted = _over(self._picture(index, shrink), background)
+            small = photo.shrunk(shrink)
+            viewmat = corrections.view(small.viewmat, self.corrections, index)
+            image, info = self._render(small, viewmat, background)
+            shown = corrections.colors(image, self.corrections, index)
+            loss = self._loss(shown, wanted)
+            if isinstance(self.strategy, DefaultStrategy):
+                self.strategy.step_pre_backward(self.params, self.optimizers, self.state, self.step, info)
+            loss.backward()
+            if math.isfinite(float(loss)):
+                self._update(info, rate)
+        self.step += 1
+        quality = psnr(shown.detach().clamp(0, 1), wanted)
+        return Progress(self.step, float(loss), quality, len(self.params["means"]), seconds)
+
+    def _update(self, info: dict[str, Any], rate: float) -> None:
+        for optimizer in (*self.optimizers.values(), *self.correcting.values()):
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        if isinstance(self.strategy, MCMCStrategy):
+            self.strategy.step_post_backward(self.params, self.optimizers, self.state, self.step, info, rate)
+        else:
+            full = len(self.params["means"]) >= self.config.max_splats
+            self.strategy.grow_grad2d = math.inf if full else DefaultStrategy.grow_grad2d
+            self.strategy.step_post_backward(self.params, self.optimizers, self.state, self.step, info)
+
+    def _loss(self, shown: Tensor, wanted: Tensor) -> Tensor:
+        weight = self.config.ssim_weight
+        loss = (1 - weight) * (shown - wanted).abs().mean()
+        loss = loss + weight * (1 - ssim(shown, wanted)) if weight else loss
+        if self.config.strategy == "mcmc":
+            loss = loss + _OPACITY_WEIGHT * self.params["opacities"].sigmoid().mean()
+            loss = loss + _SCALE_WEIGHT * self.params["scales"].exp().mean()
+        return loss
+
+    def _render(self, photo: Photo, viewmat: Tensor, background: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        p = self.params
+        image, _, info = rasterization(
+            p["means"],
+            p["quats"],
+            p["scales"].exp(),
+            p["opacities"].sigmoid(),
+            gaussians.harmonics(p),
+            viewmat[None],
+            photo.K[None],
+            photo.width,
+            photo.height,
+            sh_degree=self.config.degree(self.step),
+            backgrounds=background[None],
+            packed=False,
+        )
+        return image[0], info
+
+    def _photo(self) -> int:
+        """Which photo this step learns from: each once, in a new order every round."""
+        count = len(self.capture.photos)
+        turn = torch.Generator().manual_seed(self.config.seed * 7919 + self.step // count)
+        return int(torch.randperm(count, generator=turn)[self.step % count])
+
+    def _picture(self, index: int, shrink: int) -> Tensor:
+        if (index, shrink) not in self._pictures:
+            self._pictures = {key: value for key, value in self._pictures.items() if key[1] == shrink}
+            pixels = self.capture.photos[index].pixels(shrink)
+            self._pictures[index, shrink] = (pixels * 255).round().byte()
+        return self._pictures[index, shrink].float() / 255
+
+    @torch.no_grad()
+    def evaluate(self) -> dict[str, Any]:
+        """Figures of the held-out photos, on white."""
+        rows = {}
+        for photo in self.capture.held_out:
+            image, _ = self._render(photo, photo.viewmat, torch.ones(3))
+            wanted, image = _over(photo.pixels(), torch.ones(3)), image.clamp(0, 1)
+            rows[photo.path.name] = {"psnr": psnr(image, wanted), "ssim": float(ssim(image, wanted))}
+        means = {
+            name: sum(row[name] for row in rows.values()) / len(rows) if rows else None for name in ("psnr", "ssim")
+        }
+        return {**means, "held_out": rows}
+
+    def checkpoint(self) -> checkpoint.Checkpoint:
+        """All that the rest of the run depends on."""
+        tensors: dict[str, Tensor] = {
+            f"param/{name}": value for name, value in (*self.params.items(), *self.corrections.items())
+        }
+        tensors |= {f"state/{name}": v for name, v in self.state.items() if isinstance(v, Tensor)}
+        tensors |= checkpoint.optimizer_tensors({**self.optimizers, **self.correcting})
+        return checkpoint.Checkpoint(self.step, self.seconds, self.config, tensors)
+
+
+def _strategy(config: TrainConfig) -> DefaultStrategy | MCMCStrategy:
+    """The strategy with its schedule in shares of the run: 3DGS's own is made for 30,000 steps."""
+    begin, every = min(500, config.steps // 14), max(1, min(100, config.steps // 70))
+    if config.strategy == "mcmc":
+        stop = max(begin + 1, int(0.8 * config.steps))
+        return MCMCStrategy(config.max_splats, refine_start_iter=begin, refine_stop_iter=stop, refine_every=every)
+    stop = max(begin + 1, config.steps // 2)
+    return DefaultStrategy(
+        refine_start_iter=begin, refine_stop_iter=stop, refine_every=every, reset_every=max(3000, config.steps // 5)
+    )
+
+
+def _over(pixels: Tensor, background: Tensor) -> Tensor:
+    """Pixels [H,W,4] on a colour [3]."""
+    return torch.lerp(background.expand_as(pixels[..., :3]), pixels[..., :3], pixels[..., 3:])
+
+
+def read_log(folder: str | Path) -> Iterator[Progress]:
+    """The progress that a run has noted."""
+    with (Path(folder) / LOG).open() as file:
+        yield from (Progress(**json.loads(line)) for line in file)
