@@ -46,6 +46,18 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "synthesis_speed": ("--sizes", "64", "--identities", "1", "--frames", "1"),
     "synthesis_scale": ("--size", "64", "--moments", "2", "--opened", "50"),
     "watermark": ("--pictures", "2", "--unmarked", "6"),
+    "scene_training": (
+        "--size",
+        "64",
+        "--spp",
+        "16",
+        "--steps",
+        "40",
+        "--splats",
+        "600",
+        "--folder",
+        "out/bench-quick/scene",
+    ),
     "endurance": ("--steps", "6", "--frames", "6"),
 }
 

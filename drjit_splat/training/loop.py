@@ -136,11 +136,11 @@ class _Run:
             if isinstance(self.strategy, DefaultStrategy):
                 self.strategy.step_pre_backward(self.params, self.optimizers, self.state, self.step, info)
             loss.backward()
-            if math.isfinite(float(loss)):
+            if math.isfinite(loss.item()):
                 self._update(info, rate)
         self.step += 1
         quality = psnr(shown.detach().clamp(0, 1), wanted)
-        return Progress(self.step, float(loss), quality, len(self.params["means"]), seconds)
+        return Progress(self.step, loss.item(), quality, len(self.params["means"]), seconds)
 
     def _update(self, info: dict[str, Any], rate: float) -> None:
         for optimizer in (*self.optimizers.values(), *self.correcting.values()):
