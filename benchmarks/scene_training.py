@@ -99,18 +99,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         rows.append({"strategy": strategy, **{k: v for k, v in figures.items() if k != "held_out"}, "peak_mb": peak})
         print(json.dumps(rows[-1]), flush=True)
-    table = [
-        "| strategy | splats | steps | minutes | held-out PSNR | held-out SSIM | peak MB |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    table = ["| strategy | splats | steps | minutes | held-out PSNR | held-out SSIM | peak MB |", "|" + "---|" * 7]
     table += [
         f"| {r['strategy']} | {r['splats']} | {r['steps']} | {r['seconds'] / 60:.1f} | {r['psnr']:.2f} dB "
         f"| {r['ssim']:.4f} | {r['peak_mb']:.0f} |"
         for r in rows
     ]
-    about = (
-        f"{len(capture.photos)} pictures of {arguments.size}x{arguments.size} pixels, {len(capture.held_out)} held out."
-    )
+    about = f"{len(capture.photos)} pictures of {arguments.size}^2 pixels, {len(capture.held_out)} held out."
     save("scene_training", "Splats trained from a Mitsuba scene", about + "\n\n" + "\n".join(table), {"rows": rows})
     lines("scene_training", {("minutes", "training PSNR, dB"): curves}, log="")
     return 0

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..rasterizer import rasterization
 from ..strategy import DefaultStrategy, MCMCStrategy
+from ..strategy.ops import remove
 from . import checkpoint, corrections, gaussians
 from .captures import Capture, Photo
 from .config import TrainConfig
@@ -152,6 +153,10 @@ class _Run:
             full = len(self.params["means"]) >= self.config.max_splats
             self.strategy.grow_grad2d = math.inf if full else DefaultStrategy.grow_grad2d
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, self.step, info)
+            if (count := len(self.params["means"])) > self.config.max_splats:
+                faintest = self.params["opacities"].detach().argsort()[: count - self.config.max_splats]
+                surplus = torch.zeros(count, dtype=torch.bool).index_fill(0, faintest, True)
+                remove(self.params, self.optimizers, self.state, surplus)
 
     def _loss(self, shown: Tensor, wanted: Tensor) -> Tensor:
         weight = self.config.ssim_weight

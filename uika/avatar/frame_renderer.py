@@ -67,7 +67,7 @@ class FrameRenderer:
         self._avatar, self._own_head = avatar, head
         self._still = (_flat(avatar.quats), _flat(avatar.scales))
         self._opacities, self._colors = _flat(avatar.opacities), _flat(avatar.colors)
-        self._closing = {} if closing is None else {"closing": closing}
+        self._closing = closing
         self._background = _flat(torch.tensor(list(background)))
 
     @torch.no_grad()
@@ -90,12 +90,14 @@ class FrameRenderer:
 
     def project(self, mesh: PosedMesh, camera: Camera) -> ProjectedFrame:
         """Begin with one frame: queue its Gaussians and their projection; nothing is waited for."""
+        from drjit_splat.constants import T_CLOSING
         from drjit_splat.frames import project_frame
 
         posed = self.gaussians(mesh)
         view, intrinsics = _flat(camera.viewmat), _flat(camera.K)
+        closing = T_CLOSING if self._closing is None else self._closing
         size = camera.width, camera.height
-        return project_frame(*posed, self._opacities, self._colors, view, intrinsics, *size, **self._closing)
+        return project_frame(*posed, self._opacities, self._colors, view, intrinsics, *size, closing)
 
     def blend(self, projected: ProjectedFrame, last: Frame | None = None) -> Frame:
         """Wait for a frame's projection and queue the rest; quicker with the `last` frame of the film."""

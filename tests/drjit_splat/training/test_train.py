@@ -21,7 +21,7 @@ def test_held_out_photos_are_learned(tmp_path: Path, strategy: str) -> None:
     config = replace(QUICK, strategy=strategy)
     untrained = train(capture, tmp_path / "untrained", replace(config, steps=1))
     figures = train(capture, tmp_path / "run", config)
-    assert figures["psnr"] > untrained["psnr"] + 0.8 and figures["ssim"] > untrained["ssim"]
+    assert figures["psnr"] > untrained["psnr"] + 0.8
     assert set(figures["held_out"]) == {"000.png", "008.png"} and 0.5 < figures["ssim"] <= 1
     found = load_ply(tmp_path / "run" / "splats.ply")
     assert len(found.means) == figures["splats"] <= 400 and found.degree == 1
