@@ -102,7 +102,7 @@ def test_broken_config(saved: tuple[Path, Reconstructor]) -> None:
         load_checkpoint(path)
 
 
-def test_missing_unexpected_and_misshapen_tensors_are_listed(saved: tuple[Path, Reconstructor]) -> None:
+def test_missing_unknown_and_misshapen_tensors_are_listed(saved: tuple[Path, Reconstructor]) -> None:
     path, _ = saved
     tensors = load_file(path)
     tensors["stranger"] = torch.zeros(1)
@@ -113,7 +113,7 @@ def test_missing_unexpected_and_misshapen_tensors_are_listed(saved: tuple[Path, 
         load_checkpoint(path)
     message = str(caught.value)
     assert "missing: gs_decoder.mlp_net.layers.0.weight" in message
-    assert "unexpected: stranger" in message
+    assert "unknown: stranger" in message
     assert "transformer.uv_token [2, 3] instead of [64, 32]" in message
 
 

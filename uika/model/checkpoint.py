@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,20 +80,8 @@ def load_checkpoint(path: str | Path) -> Reconstructor:
     except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError) as error:
         raise CheckpointError(f"{path}: its config describes no model ({error})") from error
     expected = model.state_dict()
-    problems = [
-        listing("missing", [name for name in expected if name not in tensors]),
-        listing("unexpected", [name for name in tensors if name not in expected]),
-        listing(
-            "wrong shape",
-            [
-                f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
-                for name, value in expected.items()
-                if name in tensors and tensors[name].shape != value.shape
-            ],
-        ),
-    ]
-    if any(problems):
-        raise CheckpointError(f"{path}: tensors do not fit the config: {'; '.join(filter(None, problems))}")
+    if problems := misfits(tensors, expected):
+        raise CheckpointError(f"{path}: tensors do not fit the config: {problems}")
     model.load_state_dict(tensors, assign=True)
     return model.eval()
 
@@ -127,6 +115,21 @@ def check_depth(path: str | Path, blocks: int, tensors: int) -> None:
     """
     if blocks > tensors:
         raise CheckpointError(f"{path}: its config speaks of {blocks} blocks, but the file holds {tensors} tensors")
+
+
+def misfits(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], unused: Sequence[str] = ()) -> str:
+    """What keeps a file's tensors from being a model's, in one line; empty if nothing does."""
+    shapes = [
+        f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
+        for name, value in expected.items()
+        if name in tensors and tensors[name].shape != value.shape
+    ]
+    problems = (
+        listing("missing", [name for name in expected if name not in tensors]),
+        listing("unknown", [name for name in tensors if name not in expected and name not in unused]),
+        listing("misshapen", shapes),
+    )
+    return "; ".join(filter(None, problems))
 
 
 def listing(kind: str, names: list[str]) -> str:

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from uika.model.backbone import VisionTransformer
-from uika.model.checkpoint import CheckpointError, listing
+from uika.model.checkpoint import CheckpointError, misfits
 from uika.model.config import BackboneConfig
 
 _T = TypeVar("_T")
@@ -58,20 +58,8 @@ def load_backbone(model: VisionTransformer, path: str | Path) -> None:
         # Hugging Face computes the periods and leaves out the keys' bias, which is switched off.
         if name.endswith(("periods", "bias_mask")) and name not in tensors:
             tensors[name] = value
-    problems = [
-        listing("missing", [name for name in expected if name not in tensors]),
-        listing("unknown", [name for name in tensors if name not in expected and name != "mask_token"]),
-        listing(
-            "misshapen",
-            [
-                f"{name} {list(tensors[name].shape)} instead of {list(value.shape)}"
-                for name, value in expected.items()
-                if name in tensors and tensors[name].shape != value.shape
-            ],
-        ),
-    ]
-    if any(problems):
-        raise CheckpointError(f"{path}: does not fit this backbone: {'; '.join(filter(None, problems))}")
+    if problems := misfits(tensors, expected, unused=("mask_token",)):
+        raise CheckpointError(f"{path}: does not fit this backbone: {problems}")
     model.load_state_dict({name: tensors[name].float() for name in expected}, assign=True)
 
 

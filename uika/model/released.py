@@ -168,8 +168,8 @@ def load(
     read = {f"{_TABLES}{name}" for name in ("valid_mask_flatten", "v_template_pix", *_BINDING)}
     known = taken | set(model.unused) | read
     model.unused |= replaced
-    strangers = [name for name in shapes if name not in known] if strict else []
-    compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, strangers)
+    unexpected = [name for name in shapes if name not in known] if strict else []
+    compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, unexpected)
     fill(model, path, {name: names[name] for name in expected if names[name] not in given}, expected)
     if given:
         encoder = {f"network.{name}": value.float() for name, value in given.items() if f"network.{name}" in expected}

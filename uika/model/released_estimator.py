@@ -30,7 +30,7 @@ def load_estimator(path: str | Path, dtype: torch.dtype = torch.float32) -> Esti
         halve(model, exempt=(model.uv_head,))
     names = {name.removeprefix(prefix): name for name in shapes if name.startswith(prefix)}
     expected = model.state_dict()
-    strangers = [old for new, old in names.items() if new not in expected and not unused_reason(old, "")]
-    compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, strangers)
+    unexpected = [old for new, old in names.items() if new not in expected and not unused_reason(old, "")]
+    compare(path, {name: tuple(value.shape) for name, value in expected.items()}, shapes, names, unexpected)
     fill(model, path, {name: names[name] for name in expected}, expected)
     return model.eval()

@@ -1,4 +1,4 @@
-"""Reading released weight files: which keys they hold, which of them nobody reads, and how the rest reaches a model."""
+"""Reading released weight files: which keys they hold, which of them are not used, and how the rest reaches a model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from uika.model.checkpoint import CheckpointError, listing
 # Keys that belong to a released file and change no result here, with the reason.
 UNUSED = {
     r".*\bmask_token": "stands for hidden patches while the backbone is pretrained",
-    r"transformer\.layers\.<last>\.attn2?\.(add_q_proj|norm_added_q)\.\w+": "asks for an update that nobody reads",
+    r"transformer\.layers\.<last>\.attn2?\.(add_q_proj|norm_added_q)\.\w+": "computes an update that is not used",
     r"renderer\.flame_model\.(shapedirs|posedirs|J_regressor|lbs_weights)_pix": "animation is done by `uika.head`",
     r"renderer\.flame_model\.(v_template|shapedirs|posedirs|J_regressor|parents|lbs_weights)": "the head model itself",
     r"renderer\.flame_model\.(full_lmk_faces_idx|full_lmk_bary_coords|neck_kin_chain)": "landmarks of the head model",
@@ -31,7 +31,7 @@ _TENSORS_AT_ONCE = 32
 
 
 def unused_reason(name: str, last: str) -> str | None:
-    """Why nobody reads a key, if nobody does; `last` is the number of the last block."""
+    """Why a key is not used; None if it is; `last` is the number of the last block."""
     return next((why for rule, why in UNUSED.items() if re.fullmatch(rule.replace("<last>", last), name)), None)
 
 
@@ -51,7 +51,7 @@ def compare(
     expected: Mapping[str, tuple[int, ...]],
     shapes: Mapping[str, tuple[int, ...]],
     names: Mapping[str, str],
-    strangers: list[str],
+    unexpected: list[str],
 ) -> None:
     """Raise CheckpointError if a model's tensors are not in a file with `shapes`, `names` being new -> old names."""
     missing = [name for name in expected if name not in names]
@@ -63,7 +63,7 @@ def compare(
     problems = [
         listing("missing", [_released(name) for name in missing]),
         listing("misshapen", wrong),
-        listing("unknown (strict=False ignores these)", strangers),
+        listing("unknown (strict=False ignores these)", unexpected),
     ]
     if any(problems):
         raise CheckpointError(f"{path}: {'; '.join(filter(None, problems))}")
