@@ -159,7 +159,7 @@ def _check(tensors: dict[str, Any], settings: Settings, backgrounds: Any | None)
     for name, tensor in (tensors | {"backgrounds": backgrounds}).items():
         if tensor is None and name not in needed:
             continue
-        if not dr.is_tensor_v(tensor) or not dr.is_float_v(tensor) or not dr.is_jit_v(tensor):
+        if tensor is None or not dr.is_tensor_v(tensor) or not dr.is_float_v(tensor) or not dr.is_jit_v(tensor):
             raise ValueError(
                 f"{name} must be a Dr.Jit tensor of a backend (drjit.llvm.ad.TensorXf), not {_kind(tensor)}"
             )

@@ -81,3 +81,50 @@ def test_torch_is_not_needed() -> None:
     code = "import sys; import drjit_splat.drjit_api; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_cameras_are_checked_as_through_torch() -> None:
+    scene = random_scene(count=20)
+    turned = scene["viewmats"].mT
+
+    def intrinsics(row: int, column: int, value: float) -> torch.Tensor:
+        changed = scene["Ks"].clone()
+        changed[0, row, column] = value
+        return changed
+
+    cases: list[tuple[str, torch.Tensor, str]] = [
+        ("Ks", intrinsics(0, 1, 9.0), r"skew \(9"),
+        ("Ks", intrinsics(1, 1, -60.0), "positive focal lengths"),
+        ("Ks", intrinsics(0, 0, torch.nan), r"Ks\[0, 0, 0\] is nan"),
+        ("viewmats", turned, "is it transposed"),
+        ("viewmats", scene["viewmats"] * torch.inf, r"viewmats\[0, 0, 0\] is inf"),
+        ("backgrounds", scene["backgrounds"] * torch.nan, r"backgrounds\[0, 0\] is nan"),
+    ]
+    for name, value, message in cases:
+        for kind in (rasterization, drjit_api.rasterization):
+            arguments: dict[str, Any] = scene | {name: value}
+            if kind is drjit_api.rasterization:
+                arguments = {k: TensorXf(v.contiguous().numpy()) for k, v in arguments.items()}
+            with pytest.raises(ValueError, match=message):
+                kind(**arguments, width=8, height=8)
+
+
+def test_other_arguments_are_checked_as_through_torch() -> None:
+    import numpy as np
+
+    scene = {k: TensorXf(v.numpy()) for k, v in random_scene(count=20).items()}
+    expected = drjit_api.rasterization(**scene, width=8, height=6, packed=True, camera_model="pinhole")[0].numpy()
+    same = drjit_api.rasterization(**scene, width=np.int64(8), height=np.int32(6), with_ut=False, rays=None)[0].numpy()
+    assert (expected == same).all() and expected.shape == (1, 6, 8, 3)
+    with pytest.raises(ValueError, match=r"^with_ut=True is not available"):
+        drjit_api.rasterization(**scene, width=8, height=6, with_ut=True)
+    with pytest.raises(TypeError, match="'colour'"):
+        drjit_api.rasterization(**scene, width=8, height=6, colour=1)
+    depth = drjit_api.rasterization(**(scene | {"colors": None}), width=8, height=6, render_mode="D")[0]
+    assert depth.shape == (1, 6, 8, 1)
+    with pytest.raises(ValueError, match=r"^colors must be a Dr\.Jit tensor"):
+        drjit_api.rasterization(**(scene | {"colors": None}), width=8, height=6)
+    from drjit.scalar import TensorXf as Scalar
+
+    with pytest.raises(ValueError, match=r"^means must be .* not drjit\.scalar"):
+        drjit_api.rasterization(**(scene | {"means": Scalar([0.0] * 60, (20, 3))}), width=8, height=6)
