@@ -41,6 +41,7 @@ class Call:
     traces: list[Trace] = field(default_factory=list)  # one an image
     asked: tuple[bool, ...] = ()  # which inputs of the first node want gradients
     looked: set[str] = field(default_factory=set)  # names of the results in between that somebody has seen
+    rows: Tensor | None = None  # of a packed call's visible splats among [I * N], once they are known
     images: tuple[Tensor, Tensor] | None = None  # sums and coverage, on their way to the second node
     pending: Pending | None = None
 

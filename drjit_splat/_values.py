@@ -30,7 +30,11 @@ def visible_rows(call: Call) -> Tensor:
 def packed(call: Call, full: Tensor, size: int) -> Tensor:
     """Rows [I * N or nnz, `size`] of values [I, N, `size`]; of visible splats only if the call is packed."""
     rows = full.reshape(-1, size)
-    return rows[visible_rows(call)] if call.packed and len(rows) else rows
+    if not call.packed or not len(rows):
+        return rows
+    if call.rows is None:
+        call.rows = visible_rows(call).nonzero()[:, 0]
+    return rows[call.rows]
 
 
 def unpacked(call: Call, rows: Tensor, size: int) -> Tensor:
