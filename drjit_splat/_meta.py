@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -21,7 +22,7 @@ Maker = Callable[["Meta"], Any]
 
 
 class Meta(dict[str, Any]):
-    """A dict whose values are worked out at first access; copies and pickles are plain dicts of detached tensors."""
+    """A dict whose values are worked out at first access; pickles and deep copies hold detached tensors."""
 
     def __init__(self, makers: Mapping[str, Maker]) -> None:
         """Values by name, as functions that make them from the rest."""
@@ -103,8 +104,9 @@ class Meta(dict[str, Any]):
         return repr(self.copy())
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle as a plain dict."""
-        return dict, ({key: v.detach() if isinstance(v, Tensor) else v for key, v in self.copy().items()},)
+        """Pickle as a dict of a type that `torch.load` reads without further ado."""
+        values = ((key, v.detach() if isinstance(v, Tensor) else v) for key, v in self.copy().items())
+        return OrderedDict, (), None, None, values
 
 
 def describe(
