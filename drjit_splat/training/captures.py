@@ -66,36 +66,6 @@ class Capture:
         return max(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()), 1e-6)
 
 
-def open_capture(path: str | Path, every: int = 8) -> Capture:
-    """Read a data set.
-
-    Args:
-        path: a COLMAP folder (`sparse/0` or the tables themselves, beside `images`), a `transforms.json` of
-            nerfstudio or its folder, or a folder of NeRF-synthetic with `transforms_train.json`.
-        every: each so many-th photo is held out, where the data set does not say which are.
-
-    Raises:
-        ValueError: there is no data set, or it cannot be used; the message names the file.
-    """
-    from .colmap import colmap_folder, read_colmap
-    from .transforms import read_blender, read_transforms
-
-    place = Path(path)
-    if every < 2:
-        raise ValueError(f"every: must be at least 2, not {every}")
-    if not place.exists():
-        raise ValueError(f"{place}: no such data set")
-    if place.is_file() or (place / "transforms.json").is_file():
-        return _split(read_transforms(place if place.is_file() else place / "transforms.json"), every)
-    if (place / "transforms_train.json").is_file():
-        return _checked(read_blender(place))
-    if (tables := colmap_folder(place)) is not None:
-        return _split(read_colmap(place, tables), every)
-    raise ValueError(
-        f"{place}: holds neither transforms.json, transforms_train.json nor COLMAP tables (cameras, images, points3D)"
-    )
-
-
 def rigid(viewmat: NDArray[np.float64], source: str) -> Tensor:
     """A world-to-camera matrix [4,4] as float32.
 
@@ -107,25 +77,6 @@ def rigid(viewmat: NDArray[np.float64], source: str) -> Tensor:
     if not sound or np.linalg.det(turn) < 0:
         raise ValueError(f"{source}: its pose is no rotation with a translation")
     return torch.from_numpy(viewmat.astype(np.float32))
-
-
-def _split(capture: Capture, every: int) -> Capture:
-    photos = sorted(capture.photos, key=lambda photo: photo.path)
-    held_out = tuple(photos[::every]) if len(photos) >= every else ()
-    return _checked(
-        replace(capture, photos=tuple(p for i, p in enumerate(photos) if i % every or not held_out), held_out=held_out)
-    )
-
-
-def _checked(capture: Capture) -> Capture:
-    """The capture, if it has photos and their files are there."""
-    if not capture.photos:
-        raise ValueError("the data set has no photos with poses")
-    missing = [photo.path for photo in (*capture.photos, *capture.held_out) if not photo.path.is_file()]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ValueError(f"{missing[0]}: the data set names this picture, which is not there{more}")
-    return capture
 
 
 def _axes(photos: Sequence[Photo]) -> tuple[Tensor, Tensor]:

@@ -35,8 +35,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train and say what came out."""
-    from .captures import open_capture
     from .config import TrainConfig
+    from .datasets import open_capture
     from .loop import SPLATS, Progress, train
 
     config = TrainConfig(**{field.name: getattr(arguments, field.name) for field in fields(TrainConfig)})
