@@ -16,6 +16,7 @@ import pytest
 
 from tests.avatars import painted_avatar
 from uika import load_head
+from uika.assets import PORTRAIT
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
@@ -102,6 +103,8 @@ def test_cli_shows_help_renders_and_exports(installed: Installed, avatar: Path) 
     installed.run("uika", "render", avatar, "-o", "me.png", "--size", "64")
     installed.run("uika", "animate", avatar, "--motion", "expressions", "-o", "me.mp4", "--size", "64")
     installed.run("uika", "export", avatar, "-o", "me.ply")
+    said = installed.run("uika", "reconstruct", PORTRAIT, "-o", "you.safetensors", code=2)
+    assert 'pip install "uika-drjit[photo]"' in said and said.count("\n") == 1, said
     assert {path.name for path in installed.folder.iterdir()} >= {"me.png", "me.mp4", "me.ply"}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uika.assets import FACE_MODELS
+from uika.errors import UikaError, install_command
 
 _THREADS = 4  # more gain nothing with models of this size
 _STDERR_LOCK = threading.RLock()
@@ -23,7 +24,7 @@ def run(name: str, *inputs: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     """The outputs of the model `uika/assets/face/NAME.tflite` for its inputs, in their order.
 
     Raises:
-        ImportError: LiteRT is not installed.
+        UikaError: LiteRT is not installed.
     """
     with _RUN_LOCK:  # an interpreter holds one set of tensors
         interpreter = _interpreter(name)
@@ -37,8 +38,8 @@ def run(name: str, *inputs: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 def _interpreter(name: str) -> Any:
     try:
         from ai_edge_litert.interpreter import Interpreter
-    except ImportError as error:
-        raise ImportError("reading photos needs ai-edge-litert: pip install 'uika-drjit[photo]'") from error
+    except ModuleNotFoundError as error:
+        raise UikaError(f"reading photos needs ai-edge-litert; run: {install_command('ai_edge_litert')}") from error
     with _native_stderr_closed():
         interpreter = Interpreter(str(FACE_MODELS / f"{name}.tflite"), num_threads=min(_THREADS, os.cpu_count() or 1))
         interpreter.allocate_tensors()
