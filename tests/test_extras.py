@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -127,12 +128,15 @@ def test_scenes_renders_and_validates(installed: Installed) -> None:
 
 @only("view")
 def test_view_serves_the_page(installed: Installed, avatar: Path) -> None:
-    words = installed.command("uika", "view", avatar, "--port", "8765")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = installed.command("uika", "view", avatar, "--port", str(port))
     with subprocess.Popen(words, cwd=installed.folder, env=installed.environment, stderr=subprocess.PIPE) as server:
-        deadline, page = time.monotonic() + 120, b""
+        deadline, page = time.monotonic() + 300, b""
         while not page and server.poll() is None and time.monotonic() < deadline:
             try:
-                page = urllib.request.urlopen("http://127.0.0.1:8765", timeout=10).read()
+                page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10).read()
             except OSError:
                 time.sleep(0.5)
         server.send_signal(signal.SIGINT)
@@ -151,6 +155,12 @@ def test_train_makes_data_trains_and_evaluates(installed: Installed) -> None:
     network = next(installed.folder.glob("run/*.safetensors"))
     given = ("--model", network, "--setting", "mono", "--views", "1", "--targets", "1", "--size", "96")
     installed.run("uika", "evaluate", "--data", "people", "-o", "report", "--correspondence", "exact", *given)
+
+
+@only("bake")
+def test_bake_makes_the_head(installed: Installed) -> None:
+    installed.run("python", ROOT / "tools" / "bake_head.py", "-o", "head.npz")
+    installed.run("python", "-c", "import uika; uika.load_head('head.npz')")
 
 
 @only("all")
