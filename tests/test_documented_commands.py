@@ -19,6 +19,7 @@ import pytest
 
 import drjit_splat.cli
 from tests.documented import PAGES, ROOT, examples, mentioned, shown
+from tests.drjit_splat.training.made_up import write_colmap
 from tests.filmed import act
 from tests.spoken import SENTENCE, spoken, write_wav
 from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
@@ -30,7 +31,7 @@ from uika.safeguards import mark, picture_provenance
 SHOWN = list(dict.fromkeys(command for page in PAGES for command in shown(page)))
 ALL = list(dict.fromkeys([*SHOWN, *(command for page in PAGES for command in mentioned(page)), *examples()]))
 # What takes minutes or does not end by itself is stopped after so many seconds.
-LONG = {"uika view": 20, "uika train": 60, "uika synthesize": 60, "uika evaluate": 60}
+LONG = {"uika view": 20, "uika train": 60, "uika synthesize": 60, "uika evaluate": 60, "drjit-splat train": 20}
 RUN = [command for command in SHOWN if command.startswith(("uika ", "drjit-splat "))]
 
 
@@ -88,6 +89,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "words.txt").write_text("Hello, nice to meet you.")
     view = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 256, "height": 256}
     (place / "cameras.json").write_text(json.dumps([view] * 4))
+    write_colmap(place / "garden", binary=True)
     return place
 
 
@@ -117,7 +119,8 @@ def test_long_command_starts(command: str, folder: Path, tmp_path: Path) -> None
         few = ["--identities", "2", "--views", "3", "--frames", "4", "--size", "128"]
         assert main(["synthesize", "-o", str(folder / data), *few]) == 0
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    arguments = [sys.executable, "-m", *words]
+    module = {"drjit-splat": "drjit_splat.cli"}.get(words[0], words[0])
+    arguments = [sys.executable, "-m", module, *words[1:]]
     if command.startswith("uika synthesize"):
         arguments[arguments.index("-o") + 1] = str(tmp_path)  # what others read is whole
     # In a group of its own, which is interrupted as a terminal does it.
