@@ -75,13 +75,13 @@ def _faces(overview: NDArray[np.uint8], squares: list[Square], shrink: float) ->
 def _refine(photo: NDArray[np.uint8], face: Square) -> NDArray[np.float64] | None:
     """Landmarks from a first crop around the detection, then the mean over crops centred on those landmarks."""
     centre, side = np.array(face[:2]) + face[2] / 2, face[2] * FACE_MARGIN
-    first = _meshes(photo, [_square(centre, side)])[0]
+    first = meshes_in(photo, [_square(centre, side)])[0]
     if first is None:
         return None
     low, high = first.min(axis=0), first.max(axis=0)
     side = FACE_MARGIN * float((high - low).max())
     squares = [_square((low + high) / 2 + side * np.array([dx, dy]), side * scale) for scale, dx, dy in PASSES]
-    found = np.array([mesh for mesh in _meshes(photo, squares) if mesh is not None])
+    found = np.array([mesh for mesh in meshes_in(photo, squares) if mesh is not None])
     if len(found) < 2:
         return None
     mean = found.mean(axis=0)
@@ -90,7 +90,8 @@ def _refine(photo: NDArray[np.uint8], face: Square) -> NDArray[np.float64] | Non
     return mean if size > MIN_FACE and spread < MAX_SPREAD * size else None
 
 
-def _meshes(photo: NDArray[np.uint8], squares: list[Square]) -> list[NDArray[np.float64] | None]:
+def meshes_in(photo: NDArray[np.uint8], squares: list[Square]) -> list[NDArray[np.float64] | None]:
+    """Landmarks [478,2] in photo pixels of the largest face in each square of it, or None."""
     meshes = face_meshes([resample(photo, square, MESH_SIDE) for square in squares])
     return [
         None if mesh is None else to_photo(mesh, square, MESH_SIDE)

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from uika.photo import matte
 from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
-from uika.photo.detect import MIN_FACE, find_face
+from uika.photo.detect import find_face
 from uika.photo.error import PhotoError
 from uika.photo.foreground import estimate_foreground
 from uika.photo.networks import person_mask
-from uika.photo.orientation import turned_by
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
+from uika.photo.trust import doubt
 
 HEAD_TO_FACE = 1.35  # height of a head over the height of its face, forehead line to chin
 CROP_TO_HEAD = 1.5  # side of the crop over the larger side of the head box (released inference settings)
@@ -67,10 +67,10 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
     face = find_face(rgb)
     if face is None:
         raise PhotoError(
-            path, f"shows no face of {MIN_FACE} px or more; use an upright photo with the whole face in view"
+            path, "no face is found in it; use an upright, sharp photo with the whole face in view, 50 px high or more"
         )
-    if degrees := turned_by(rgb, face):
-        raise PhotoError(path, f"the face in it is not upright; turn the photo by {degrees} degrees counterclockwise")
+    if problem := doubt(rgb, face):
+        raise PhotoError(path, problem)
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
     crop = resample(rgb, square, size)

@@ -137,7 +137,7 @@ def track_video(
 def _look(path: Path, progress: bool, place: PlaceLandmarks | None) -> _Seen:
     """Landmarks of all frames, and views of evenly spread key frames."""
     from uika.photo.networks import follow_meshes
-    from uika.photo.orientation import turned_by
+    from uika.photo.trust import turned_by
 
     landmarks: list[Array | None] = []
     keys: dict[int, FaceCrop] = {}
