@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .prepared import Prepared, prepare
     from .profiling import profile
     from .rasterizer import rasterization
+    from .spz import load_spz, save_spz
 
 _HOMES = {
     "Frame": "frames",
@@ -21,11 +22,13 @@ _HOMES = {
     "ProjectedFrame": "frames",
     "SplatFile": "ply",
     "load_ply": "ply",
+    "load_spz": "spz",
     "prepare": "prepared",
     "profile": "profiling",
     "project_frame": "frames",
     "rasterization": "rasterizer",
     "save_ply": "ply",
+    "save_spz": "spz",
 }
 
 __all__ = [
@@ -35,12 +38,14 @@ __all__ = [
     "ProjectedFrame",
     "SplatFile",
     "load_ply",
+    "load_spz",
     "prepare",
     "profile",
     "project_frame",
     "rasterization",
     "reference",
     "save_ply",
+    "save_spz",
 ]
 
 
