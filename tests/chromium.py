@@ -4,7 +4,7 @@ import base64
 import json
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -111,14 +111,14 @@ class Page:
 
 
 @contextmanager
-def page(folder: Path, width: int = 900, height: int = 700) -> Iterator[Page]:
+def page(folder: Path, width: int = 900, height: int = 700, flags: Sequence[str] = ()) -> Iterator[Page]:
     """A tab of a browser with a fresh profile in `folder`; skips the test where there is no Chromium."""
     program = setup_chromium.find()
     if program is None:
         pytest.skip("no Chromium: install the package 'chromium' to test in a browser")
     connect = pytest.importorskip("websockets.sync.client", reason="no websockets: install the extra 'view'").connect
     profile = folder / "profile"
-    command = [program, *_FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
+    command = [program, *_FLAGS, *flags, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
     browser = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port = _port(profile / "DevToolsActivePort", browser)

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import io
+import json
 import re
 from pathlib import Path
 
@@ -14,9 +15,13 @@ from PIL import Image
 from tests.avatars import painted_avatar
 from tests.chromium import page
 from tests.heads import sphere_head
-from uika import HeadModel, Motion, UikaError, get_motion, load_head, neutral_camera, render
+from tests.served import served
+from uika import HeadModel, HeadParameters, Motion, UikaError, get_motion, load_head, neutral_camera, render
 from uika.export import html_provenance, write_html
+from uika.head import rodrigues
+from uika.head.axis_angle import axis_angle
 from uika.metrics import psnr
+from uika.motion.presets import expression_vector
 
 SIZE = 256
 
@@ -62,6 +67,89 @@ def test_page_plays_turns_and_shows_what_the_rasterizer_shows(head, motion, tmp_
         assert "ünïcode" in tab.run("document.getElementById('about').innerText")
         assert tab.problems == []
         assert {url.split(":")[0] for url in tab.requests} <= {"file", "data", "blob"}
+
+
+def still_of(url: str) -> torch.Tensor:
+    with Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))) as file:
+        return torch.from_numpy(np.array(file.convert("RGB"))) / 255
+
+
+def test_page_is_driven_by_scripts_messages_files_and_sound(head, motion, tmp_path):
+    plain = painted_avatar(head, 96)
+    avatar = dataclasses.replace(plain, colors=0.5 + 0.4 * torch.sin(60 * plain.means))
+    (tmp_path / "site").mkdir()
+    write_html(tmp_path / "site" / "a.html", avatar, motion, head)
+    frames = [{"jawOpen": 0.5, "headYaw": 0.2}, {"jawOpen": 0.5, "headYaw": 0.2}]
+    (tmp_path / "site" / "own.json").write_text(json.dumps({"fps": 30, "frames": frames}))
+    (tmp_path / "site" / "bad.json").write_text("{}}")
+    frame = "<iframe id=f src=a.html width=300 height=300></iframe>"
+    (tmp_path / "site" / "embed.html").write_text(f"<link rel=icon href=data:,>{frame}")
+    rest = HeadParameters.zeros(head).replace(identity=avatar.identity)
+
+    def ours(actions: dict[str, float], yaw: float, pitch: float, roll: float = 0.0) -> torch.Tensor:
+        turn = [torch.tensor([-pitch, 0.0, 0.0]), torch.tensor([0.0, yaw, 0.0]), torch.tensor([0.0, 0.0, -roll])]
+        x, y, z = (rodrigues(torch.deg2rad(part)) for part in turn)
+        neck = torch.from_numpy(axis_angle((y @ x @ z).double().numpy())).float()
+        params = rest.replace(expression=expression_vector(head, actions), neck=neck)
+        return render(avatar, params, neutral_camera(avatar, 10.0, 0.0, SIZE), head).rgb.clamp(0, 1)
+
+    shown = f"avatar.show({SIZE}, {SIZE}, {{yaw: 10, pitch: 0}})"
+    with served(tmp_path / "site") as address, page(tmp_path) as tab:
+        tab.open(f"{address}/a.html")
+        tab.wait("!!window.avatar")
+        assert set(tab.run("avatar.names")) == set(head.expression_names)
+        assert tab.run("avatar.set({jawOpen: 0.6, mouthSmile: 0.5, nonsense: 1})") == ["nonsense"]
+        tab.run("avatar.pose({yaw: 20, pitch: 8, roll: -6})")
+        truth = ours({"jawOpen": 0.6, "mouthSmile": 0.5}, 20, 8, -6)
+        found = psnr(still_of(tab.run(shown)), truth)
+        other = psnr(still_of(tab.run(shown)), ours({"jawOpen": 0.6}, 20, 8, -6))
+        print(f"driven: {found:.1f} dB; without the smile {other:.1f} dB")
+        assert found > 38 and other < found - 6
+        tab.run("avatar.set({jawOpen: 7, mouthSmile: 'x'}); avatar.pose({yaw: 0, pitch: NaN, roll: Infinity})")
+        assert psnr(still_of(tab.run(shown)), ours({"jawOpen": 1.0}, 0, 0)) > 38
+
+        tab.open(f"{address}/embed.html")
+        child = "document.getElementById('f').contentWindow"
+        tab.wait(f"!!{child} && !!{child}.avatar")
+        told = "{type: 'avatar', set: {mouthPucker: 0.8}, pose: {yaw: -15}}"
+        tab.run(f"{child}.postMessage({told}, '*'); {child}.postMessage('something else', '*')")
+        tab.wait("document.getElementById('f').contentDocument.getElementById('play').textContent === 'Play'")
+        assert psnr(still_of(tab.run(f"{child}.{shown}")), ours({"mouthPucker": 0.8}, -15, 0)) > 38
+
+        tab.open(f"{address}/a.html?motion=own.json")
+        tab.wait("!!window.avatar && avatar.driven")
+        tab.run("new Promise((done) => setTimeout(done, 300))")
+        assert psnr(still_of(tab.run(shown)), ours({"jawOpen": 0.5}, 0.2 * 180 / np.pi, 0)) > 38
+        tab.open(f"{address}/a.html?motion=bad.json")
+        tab.wait("document.getElementById('message')?.textContent.startsWith('bad.json: ')")
+        assert tab.problems == []
+        tab.open(f"{address}/a.html?motion=none.json")
+        tab.wait("document.getElementById('message')?.textContent.startsWith('none.json: 404')")
+
+        tab.open((tmp_path / "site" / "a.html").as_uri() + "?motion=own.json")
+        tab.wait("document.getElementById('message')?.textContent.includes('drop the file')")
+        tab.run("avatar.motion('[{\"jawOpen\": 0.5}]')")
+        tab.run("new Promise((done) => setTimeout(done, 300))")
+        assert psnr(still_of(tab.run(shown)), ours({"jawOpen": 0.5}, 0, 0)) > 38
+
+
+def test_the_microphone_opens_the_mouth(tmp_path):
+    small = sphere_head()
+    avatar = painted_avatar(dataclasses.replace(small, expression_names=("jawOpen", "a", "b")), 32)
+    write_html(
+        tmp_path / "a.html",
+        avatar,
+        get_motion("orbit", small),
+        dataclasses.replace(small, expression_names=("jawOpen", "a", "b")),
+    )
+    with page(tmp_path, flags=("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")) as tab:
+        tab.open((tmp_path / "a.html").as_uri())
+        tab.wait("!!window.avatar")
+        assert tab.run("avatar.level('jawOpen')") == 0
+        tab.run("document.getElementById('listen').click()")
+        tab.wait("avatar.level('jawOpen') > 0.1", 20)  # the browser's own test sound beeps
+        tab.run("avatar.quiet()")
+        assert tab.run("avatar.level('jawOpen')") == 0
 
 
 def test_page_cannot_be_broken_by_provenance(tmp_path):

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import base64
-import functools
-import http.server
 import io
 import json
 import shutil
 import subprocess
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +20,7 @@ from torch.nn.functional import max_pool2d
 from tests.avatars import painted_avatar
 from tests.chromium import page
 from tests.heads import sphere_head
+from tests.served import served
 from tools.setup_node import FOLDER
 from uika import Avatar, HeadModel, HeadParameters, Motion, UikaError, get_motion, load_head, neutral_camera, render
 from uika.export import write_obj, write_rigged_glb
@@ -214,17 +210,3 @@ def test_nothing_is_half_written(head, tmp_path):
     with pytest.raises(UikaError, match="was made for the head model"):
         write_obj(tmp_path / "a.obj", avatar, head)
     assert list(tmp_path.iterdir()) == []
-
-
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The folder on a port of 127.0.0.1."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *args: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()

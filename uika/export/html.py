@@ -18,7 +18,9 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.avatar.rendering import neutral_camera
 from uika.errors import UikaError
-from uika.head import HeadModel, pose_gaussians, pose_vertices
+from uika.export.driven import driven_arrays, driven_names
+from uika.export.vertex_motion import vertex_motion
+from uika.head import HeadModel, HeadParameters, rest_joints
 from uika.io.files import check_output, replacing
 from uika.motion import Motion
 
@@ -27,12 +29,14 @@ _POSITION_ERROR, _TURN_ERROR = 5e-5, 2e-3  # metres and radians/2 that the motio
 _METRES = 0.02  # of movement that count as much as one radian when modes are chosen
 _STEPS = 32767
 _ALIGNMENT = 8  # bytes
-_CHUNK = 64  # frames posed at once
+_SCRIPTS = ("drive.js", "shaders.js", "viewer.js")
 _SCENE_TAG = '<script id="scene" type="application/json">'
 
 
 def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel) -> int:
     """Write a page that plays a motion, orbits with the mouse and opens from disk without a network.
+
+    Scripts drive its face by `avatar.set`, `avatar.pose` and messages; see docs/page.md.
 
     Args:
         path: `.html` file.
@@ -48,7 +52,8 @@ def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel
     """
     target = check_output(path, ".html")
     avatar.check_head(head)
-    arrays = {**_still(avatar, head), **_moving(avatar, motion, head)}
+    arrays = {**_still(avatar, head), **_moving(avatar, motion, head), **driven_arrays(avatar, head)}
+    still = HeadParameters.zeros(head).replace(identity=avatar.identity)
     manifest, binary = _packed(arrays)
     camera = neutral_camera(avatar)
     distance = float((camera.position - _centre(avatar)).norm())
@@ -61,13 +66,16 @@ def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel
         "target": _centre(avatar).tolist(),
         "distance": distance,
         "fov": 20.0,
+        "actions": driven_names(head),
+        "neck": rest_joints(head, still)[1].tolist(),
         "provenance": dict(avatar.provenance),
     }
+    folder = resources.files("uika.export")
     page = _fill(
-        (resources.files("uika.export") / "viewer.html").read_text(encoding="utf-8"),
+        (folder / "viewer.html").read_text(encoding="utf-8"),
         {
             "SCENE": _script_safe(scene),
-            "SCRIPT": (resources.files("uika.export") / "viewer.js").read_text(encoding="utf-8"),
+            "SCRIPT": "\n".join((folder / name).read_text(encoding="utf-8") for name in _SCRIPTS),
             "DATA": base64.b64encode(gzip.compress(binary, 6, mtime=0)).decode("ascii"),
         },
     )
@@ -130,7 +138,7 @@ def _moving(avatar: Avatar, motion: Motion, head: HeadModel) -> dict[str, NDArra
 
     A frame is `mean + sum_k weights[t,k] * step[k] * modes[k]`, eight numbers a vertex: x y z, growth, w x y z.
     """
-    rows = _vertex_motion(avatar, motion, head)
+    rows = vertex_motion(avatar, motion, head)
     unit = torch.tensor([1 / _METRES] * 3 + [1.0] * 5)
     mean = rows.mean(0)
     scaled = ((rows - mean) * unit).flatten(1)
@@ -153,28 +161,6 @@ def _moving(avatar: Avatar, motion: Motion, head: HeadModel) -> dict[str, NDArra
         "steps": steps.numpy(),
         "weights": weights[:, :count].contiguous().numpy(),
     }
-
-
-def _vertex_motion(avatar: Avatar, motion: Motion, head: HeadModel) -> Tensor:
-    """[T,V,8] x y z (metres), growth, w x y z: how Gaussians that sit on the vertices move."""
-    rest = avatar.canonical_vertices(head)
-    count = len(rest)
-    triangle, barycentric = torch.zeros(count, dtype=torch.int64), torch.zeros(count, 3)
-    for corner in range(3):
-        ids = head.faces[:, corner]
-        triangle[ids] = torch.arange(len(ids))
-        barycentric[ids] = torch.eye(3)[corner]
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
-    params = motion.parameters(avatar.identity)
-    parts = []
-    for start in range(0, len(motion), _CHUNK):
-        posed = pose_vertices(head, params[start : start + _CHUNK], avatar.static_offset)
-        _, quats, scales = pose_gaussians(
-            rest, identity, torch.ones(count, 3), rest, posed, head.faces, triangle, barycentric
-        )
-        quats = torch.where(quats[..., :1] < 0, -quats, quats)
-        parts.append(torch.cat((posed, scales[..., :1], quats), -1))
-    return torch.cat(parts)
 
 
 def _rounded(values: Tensor) -> tuple[NDArray[np.int16], float]:

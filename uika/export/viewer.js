@@ -1,4 +1,3 @@
-"use strict";
 // Splats bound to a moving mesh: the vertex shader poses and projects them; the processor only sorts by depth.
 (async () => {
   const $ = (id) => document.getElementById(id);
@@ -21,68 +20,8 @@
   const data = await unpack();
   const count = scene.count, vertices = scene.vertices;
 
-  const VERTEX = `#version 300 es
-    precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
-    uniform sampler2D mesh;      // two texels a vertex: position and growth, rotation (wxyz)
-    uniform usampler2D corners;  // three vertex numbers a splat
-    uniform sampler2D still;     // two texels a splat: barycentric x y and offset x y, offset z and size
-    uniform sampler2D turn;      // rotation (wxyz)
-    uniform sampler2D paint;
-    uniform mat4 view; uniform vec2 focal; uniform vec2 size;
-    in uint index;
-    out vec4 color; out vec3 conic; out vec2 away;
-    ivec2 at(int i, int width) { return ivec2(i % width, i / width); }
-    vec3 rotate(vec4 q, vec3 v) { vec3 t = 2.0 * cross(q.yzw, v); return v + q.x * t + cross(q.yzw, t); }
-    vec4 times(vec4 p, vec4 q) {
-      return vec4(p.x * q.x - dot(p.yzw, q.yzw), p.x * q.yzw + q.x * p.yzw + cross(p.yzw, q.yzw));
-    }
-    void main() {
-      gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-      int i = int(index);
-      uvec3 c = texelFetch(corners, at(i, 1024), 0).xyz;
-      vec4 s0 = texelFetch(still, at(2 * i, 1024), 0);
-      vec4 s1 = texelFetch(still, at(2 * i + 1, 1024), 0);
-      vec3 weight = vec3(s0.xy, 1.0 - s0.x - s0.y);
-      vec4 place = vec4(0.0), spin = vec4(0.0);
-      for (int k = 0; k < 3; k++) {
-        int v = 2 * int(c[k]);
-        place += weight[k] * texelFetch(mesh, at(v, 1024), 0);
-        spin += weight[k] * texelFetch(mesh, at(v + 1, 1024), 0);
-      }
-      spin = normalize(spin);
-      vec3 mean = place.xyz + rotate(spin, vec3(s0.zw, s1.x));
-      vec3 p = (view * vec4(mean, 1.0)).xyz;
-      if (p.z < 0.01) return;
-      vec3 scale = place.w * s1.yzw;
-      vec4 q = times(spin, texelFetch(turn, at(i, 1024), 0));
-      mat3 axes = mat3(view) * mat3(rotate(q, vec3(scale.x, 0, 0)), rotate(q, vec3(0, scale.y, 0)), rotate(q, vec3(0, 0, scale.z)));
-      mat3 covariance = axes * transpose(axes);
-      vec3 jx = vec3(focal.x / p.z, 0.0, -focal.x * p.x / (p.z * p.z));
-      vec3 jy = vec3(0.0, focal.y / p.z, -focal.y * p.y / (p.z * p.z));
-      float xx = dot(jx, covariance * jx) + 0.3, xy = dot(jx, covariance * jy), yy = dot(jy, covariance * jy) + 0.3;
-      float det = xx * yy - xy * xy;
-      if (det <= 0.0) return;
-      color = texelFetch(paint, at(i, 1024), 0);
-      float reach = 2.0 * log(255.0 * color.a);
-      if (reach <= 0.0) return;
-      conic = vec3(yy, -xy, xx) / det;
-      vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-      away = corner * ceil(sqrt(reach * vec2(xx, yy)) + 0.5);
-      vec2 pixel = focal * p.xy / p.z + away;
-      gl_Position = vec4(2.0 * pixel.x / size.x, -2.0 * pixel.y / size.y, 0.0, 1.0);
-    }`;
-  const FRAGMENT = `#version 300 es
-    precision highp float;
-    in vec4 color; in vec3 conic; in vec2 away; out vec4 result;
-    void main() {
-      float s = 0.5 * (conic.x * away.x * away.x + conic.z * away.y * away.y) + conic.y * away.x * away.y;
-      float alpha = min(0.999, color.a * exp(-s));
-      if (s < 0.0 || alpha < 1.0 / 255.0) discard;
-      result = vec4(color.rgb * alpha, alpha);
-    }`;
-
   const program = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
@@ -137,11 +76,18 @@
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
 
   const state = { frame: 0, yaw: 0, pitch: 0, zoom: 1, shift: [0, 0, 0], background: [1, 1, 1] };
-  let shown = -1;
+  const face = drivenFace(scene, data);
+  let shown = -1, driven = false;
   const pose = (frame) => {
-    if (frame === shown) return;
-    shown = frame;
-    const modes = data.steps.length / 8, size = 8 * vertices, out = mesh.full;
+    if (frame === shown && !driven) return;
+    shown = driven ? -1 : frame;
+    const out = mesh.full;
+    if (driven) face.fill(out); else playedFrame(frame, out);
+    gl.activeTexture(gl.TEXTURE0 + mesh.unit);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, mesh.width, mesh.height, gl.RGBA, gl.FLOAT, out);
+  };
+  const playedFrame = (frame, out) => {
+    const modes = data.steps.length / 8, size = 8 * vertices;
     out.set(data.mean);
     for (let m = 0; m < modes; m++) {
       const gain = data.weights[frame * modes + m], base = m * size;
@@ -152,8 +98,6 @@
       const length = Math.hypot(out[i + 4], out[i + 5], out[i + 6], out[i + 7]);
       for (let k = 4; k < 8; k++) out[i + k] /= length;
     }
-    gl.activeTexture(gl.TEXTURE0 + mesh.unit);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, mesh.width, mesh.height, gl.RGBA, gl.FLOAT, out);
   };
 
   const local = new Float32Array(4 * vertices), depth = new Float32Array(count), bins = new Uint32Array(65537);
@@ -227,13 +171,24 @@
     canvas.height = Math.max(1, Math.round(canvas.clientHeight * ratio));
     dirty = true;
   };
+  let given = null;  // a motion that the page was not made with: {frames, fps}
   const play = (on) => {
     playing = on;
-    began = performance.now() - 1000 * state.frame / scene.fps;
+    if (on) driven = !!given;
+    began = performance.now() - (given ? 0 : 1000 * state.frame / scene.fps);
     $("play").textContent = on ? "Pause" : "Play";
   };
+  const show = (pose) => {
+    face.weights.fill(0);
+    face.set(pose);
+    const degrees = (name) => (Number(pose[name]) || 0) * 180 / Math.PI;  // Live Link's radians; its pitch is down
+    face.pose({ yaw: degrees("headYaw"), pitch: -degrees("headPitch"), roll: -degrees("headRoll") });
+    dirty = true;
+  };
   const tick = (now) => {
-    if (playing) {
+    if (playing && given) {
+      show(given.frames[Math.floor(Math.max(0, now - began) / 1000 * given.fps) % given.frames.length]);
+    } else if (playing) {
       const frame = Math.floor(Math.max(0, now - began) / 1000 * scene.fps) % scene.frames;
       if (frame !== state.frame) change({ frame });
     }
@@ -242,7 +197,7 @@
   };
 
   $("frame").max = scene.frames - 1;
-  $("frame").addEventListener("input", () => { play(false); change({ frame: Number($("frame").value) }); });
+  $("frame").addEventListener("input", () => { play(false); driven = false; change({ frame: Number($("frame").value) }); });
   $("play").addEventListener("click", () => play(!playing));
   $("front").addEventListener("click", () => change({ yaw: 0, pitch: 0, zoom: 1, shift: [0, 0, 0] }));
   $("shade").addEventListener("click", () => {
@@ -277,10 +232,25 @@
   fit();
   say("");
   play(true);
-  // For scripts: show one still picture of width x height pixels.
+  const drive = () => { if (playing) play(false); driven = true; dirty = true; };
+  let stopListening = null;
+  // For scripts: docs/page.md says how.
   window.avatar = {
-    show: (width, height, values) => {
+    names: face.names,
+    get driven() { return driven; },
+    level: (name) => face.weights[face.names.indexOf(name)],
+    set: (values) => { drive(); return face.set(values); },
+    pose: (values) => { drive(); face.pose(values); },
+    motion: (text) => { given = motionFrames(text); driven = true; play(true); },
+    listen: async () => {
+      if (stopListening) return;
+      stopListening = await microphoneLevel((level) => avatar.set({ jawOpen: 0.45 * level, mouthLowerDown: 0.3 * level }));
+    },
+    quiet: () => { if (stopListening) stopListening(); stopListening = null; },
+    // One still picture of width x height pixels; a frame of the page's own motion ends driving.
+    show: (width, height, values = {}) => {
       play(false);
+      if ("frame" in values) driven = false;
       canvas.width = width;
       canvas.height = height;
       Object.assign(state, values);
@@ -289,5 +259,28 @@
     },
     state,
   };
+  window.addEventListener("message", ({ data: told }) => {
+    if (!told || told.type !== "avatar") return;
+    if (told.set && typeof told.set === "object") avatar.set(told.set);
+    if (told.pose && typeof told.pose === "object") avatar.pose(told.pose);
+  });
+  const complain = (name) => (error) => say(`${name}: ${error.message || error}`);
+  const wanted = new URLSearchParams(location.search).get("motion");
+  if (wanted && location.protocol === "file:") complain(wanted)("open the page from a web server, or drop the file on it");
+  else if (wanted) {
+    fetch(wanted).then((answer) => {
+      if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
+      return answer.text();
+    }).then(avatar.motion).catch(complain(wanted));
+  }
+  window.addEventListener("dragover", (event) => event.preventDefault());
+  window.addEventListener("drop", (event) => {
+    event.preventDefault();
+    const [file] = event.dataTransfer.files;
+    if (file) file.text().then(avatar.motion).then(() => say("")).catch(complain(file.name));
+  });
+  $("listen").addEventListener("click", () => {
+    if (stopListening) avatar.quiet(); else avatar.listen().catch(complain("microphone"));
+  });
   requestAnimationFrame(tick);
 })().catch((error) => { document.getElementById("message").textContent = String(error); throw error; });
