@@ -17,19 +17,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 TILE = 128  # pixels after which the pattern repeats
-STRENGTH = 1.3  # root mean square in steps of 8-bit pictures: at least 45.8 dB
+STRENGTH = 1.4  # root mean square over a picture in steps of 8 bits: at least 45.2 dB
 THRESHOLD = 6.5  # standard deviations; chance reaches it in fewer than one of 100,000 pictures
 MIN_SIZE = 96  # pixels of a side, below which there is too little to look at
 SCALES = (1.0, 0.5, 2.0, 0.75, 1.5, 2 / 3, 4 / 3, 0.8, 1.25)  # of the picture over the rendered one
-_LOWEST, _HIGHEST = 4, 12  # periods in a tile
-_SEED = b"uika-drjit watermark 1"
+_MOST = 2.1  # steps, root mean square where a picture has detail and is flat elsewhere
+_LOWEST, _HIGHEST = 4, 26  # periods in a tile
+_SEED = b"uika-drjit watermark 2"
 _LUMA = (0.299, 0.587, 0.114)
-_FINE, _COARSE = 5, 33  # pixels: the windows whose means bound the band that is looked at
+_FINE, _COARSE = 3, 33  # pixels: the windows whose means bound the band that is looked at
 _QUIET = 0.01  # steps: what is left of a flat picture by rounding
 _NOISE = 2.0  # squared steps that a picture's own detail is held against
+_BLOCK = 8  # pixels, of the blocks whose detail is measured
+_FLAT, _BUSY = 0.35, 2.5  # steps, standard deviation in a block: the mark is left out below, and whole above
 _MAX_SIDE = 1536  # pixels that are looked at, from the middle
 
 
@@ -52,27 +55,63 @@ def mark(picture: Tensor) -> Tensor: ...
 @overload
 def mark(picture: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
 def mark(picture: Tensor | NDArray[np.uint8]) -> Tensor | NDArray[np.uint8]:
-    """Add the mark to a picture [H,W,3], floats in [0,1] or bytes; values are clipped to that range."""
+    """Add the mark to a picture [H,W,3], floats in [0,1] or bytes; values are clipped to that range.
+
+    What is flat stays as it is: there the eye would see the mark (`strength`).
+    """
     height, width = picture.shape[:2]
     if isinstance(picture, np.ndarray):
-        sums = picture + _steps(height, width)
-        return np.clip(sums, 0, 255, out=sums).astype(np.uint8)
-    return (picture + pattern(height, width).to(picture)).clamp_(0, 1)
+        shown = torch.from_numpy(np.ascontiguousarray(picture))
+        steps = (strength(shown[..., 1].float()) * _plane(height, width)).round_().to(torch.int16)
+        sums = shown.to(torch.int16).add_(steps[..., None].expand(-1, -1, 3).contiguous())
+        return sums.clamp_(0, 255).to(torch.uint8).numpy()
+    gain = strength(255 * picture[..., 1].detach().float())
+    return (picture + (gain[..., None] * pattern(height, width)).to(picture)).clamp_(0, 1)
+
+
+def strength(green: Tensor) -> Tensor:
+    """The mark's local root mean square [H,W] in steps of 8 bits, from the picture's green channel [H,W] in such steps.
+
+    Detail hides the mark (Legge and Foley, 1980), so it follows the standard deviation in blocks; a block with a flat
+    neighbour bears nothing, so that no seam lies around what is flat. What is saved there may be spent elsewhere.
+    """
+    height, width = green.shape
+    planes = pad(green[None, None], (0, -width % _BLOCK, 0, -height % _BLOCK), mode="replicate")
+    mean, square = avg_pool2d(planes, _BLOCK), avg_pool2d(planes.square(), _BLOCK)
+    detail = (square - mean.square()).clamp_min(0).sqrt()
+    share = ((detail - _FLAT) / (_BUSY - _FLAT)).clamp(0, 1)
+    share = -max_pool2d(-pad(share, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    full = interpolate(share, planes.shape[-2:], mode="bilinear", align_corners=False)
+    # What is even within a block of detail, such as the background beside an ear, bears nothing either.
+    shape = torch.where(_uneven(green), full[0, 0, :height, :width], 0.0)
+    level = float(shape.square().mean().sqrt())
+    return shape * min(_MOST, STRENGTH / max(level, 1e-6))
+
+
+def _uneven(green: Tensor) -> Tensor:
+    """Which pixels [H,W] differ by a step from one beside them, above or below."""
+    across, down = ((green.diff(dim=dim)).abs() >= 1 for dim in (1, 0))
+    result = torch.zeros_like(green, dtype=torch.bool)
+    result[:, 1:] |= across
+    result[:, :-1] |= across
+    result[1:] |= down
+    result[:-1] |= down
+    return result
 
 
 @lru_cache(maxsize=4)
 def pattern(height: int, width: int) -> Tensor:
-    """The mark [H,W,3], the same in every channel, for pictures in [0,1]."""
+    """The mark [H,W,3], the same in every channel, for pictures in [0,1]; its root mean square is one step of 8 bits."""
     tile = torch.fft.ifft2(_spectrum()).real
-    tile = tile / tile.square().mean().sqrt() * STRENGTH / 255
+    tile = tile / tile.square().mean().sqrt() / 255
     repeats = (math.ceil(height / TILE), math.ceil(width / TILE))
     return tile.repeat(*repeats)[:height, :width].float()[..., None].repeat(1, 1, 3)
 
 
 @lru_cache(maxsize=4)
-def _steps(height: int, width: int) -> NDArray[np.int16]:
-    """The mark in whole steps of 8-bit pictures."""
-    return (pattern(height, width) * 255).round().short().numpy()
+def _plane(height: int, width: int) -> Tensor:
+    """One channel of the mark [H,W] in steps of 8-bit pictures."""
+    return (pattern(height, width)[..., 0] * 255).contiguous()
 
 
 def detect(pictures: Iterable[Tensor], scales: tuple[float, ...] = SCALES) -> Detection:
