@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from tests.avatars import painted_avatar
@@ -22,7 +23,9 @@ def folder(tmp_path, monkeypatch) -> Path:
     save_head(sphere_head(), tmp_path / "small.npz")
     monkeypatch.setenv("UIKA_HEAD", str(tmp_path / "small.npz"))
     monkeypatch.chdir(tmp_path)
-    stamped(painted_avatar(load_head(), 32), consent=True, time=NOON).save("a.safetensors")
+    avatar = painted_avatar(load_head(), 64)
+    avatar.colors.copy_(0.5 + 0.3 * torch.sin(120 * avatar.means))  # the mark needs some detail to hide in
+    stamped(avatar, consent=True, time=NOON).save("a.safetensors")
     return tmp_path
 
 

@@ -101,7 +101,7 @@ def _uneven(green: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4)
 def pattern(height: int, width: int) -> Tensor:
-    """The mark [H,W,3], the same in every channel, for pictures in [0,1]; its root mean square is one step of 8 bits."""
+    """The mark [H,W,3], the same in every channel, for pictures in [0,1]; root mean square: one step of 8 bits."""
     tile = torch.fft.ifft2(_spectrum()).real
     tile = tile / tile.square().mean().sqrt() / 255
     repeats = (math.ceil(height / TILE), math.ceil(width / TILE))
