@@ -65,7 +65,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.summary
 	$(BIN)/python tools/readme_figures.py
 
-# Shows that every benchmark runs, in less than three minutes.
+# Shows that every benchmark runs, in some minutes.
 bench-quick: setup
 	$(BIN)/python -m benchmarks --quick
 
