@@ -21,6 +21,7 @@ from uika.head import (
     shaped_vertices,
     skin_points,
 )
+from uika.head.light import COUNT
 from uika.io.files import write_tensors
 
 Skinning = Literal["surface", "released"]
@@ -52,6 +53,7 @@ class Avatar:
     barycentric: Tensor  # [M,3] its surface point
     provenance: Mapping[str, str] = field(default_factory=dict)
     skinning: Skinning = "surface"  # how it is moved, see `pose`
+    light: Tensor | None = None  # [9,3] that the colours are kept under, see `uika.head.light`; None if unknown
 
     def __post_init__(self) -> None:
         """Check shapes, types and values.
@@ -70,9 +72,12 @@ class Avatar:
             "colors": (count, 3),
             "triangle": (count,),
             "barycentric": (count, 3),
+            "light": (COUNT, 3),
         }
         for name, shape in shapes.items():
             tensor = getattr(self, name)
+            if tensor is None and name in _OPTIONAL:
+                continue
             dtype = torch.int64 if name == "triangle" else torch.float32
             if tuple(tensor.shape) != shape or tensor.dtype != dtype:
                 raise AvatarError(
@@ -95,7 +100,7 @@ class Avatar:
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file; it appears under its name only when it is complete."""
-        tensors = {name: getattr(self, name).contiguous() for name in _TENSORS}
+        tensors = {name: value.contiguous() for name in _TENSORS if (value := getattr(self, name)) is not None}
         metadata = {
             "format": FORMAT,
             "version": VERSION,
@@ -183,6 +188,7 @@ class Avatar:
         )
 
 
+_OPTIONAL = {"light"}  # files of earlier versions lack them
 _TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance", "skinning"))
 
 
@@ -201,13 +207,13 @@ def _read(path: Path) -> dict[str, Any]:
                     "make the avatar again"
                 )
             names = set(file.keys())
-            if names != set(_TENSORS):
-                odd = ", ".join(sorted(names ^ set(_TENSORS))[:5])
+            if names | _OPTIONAL != set(_TENSORS):
+                odd = ", ".join(sorted((names | _OPTIONAL) ^ set(_TENSORS))[:5])
                 raise AvatarError(f"{path}: has missing or unknown tensors ({odd}); make the avatar again")
             provenance = json.loads(metadata["provenance"])
             if not isinstance(provenance, dict):
                 raise AvatarError(f"{path}: has an unreadable provenance entry; make the avatar again")
-            tensors = {name: file.get_tensor(name) for name in _TENSORS}
+            tensors = {name: file.get_tensor(name) for name in names}
             return {
                 "head_id": metadata["head_id"],
                 "provenance": {str(key): str(value) for key, value in provenance.items()},

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from uika.cli.lighting import under_light
 from uika.errors import UikaError
 from uika.io.files import check_output
 
@@ -44,6 +45,10 @@ class Animate:
     """The video to write."""
     size: int = 512
     """Side of the picture in pixels, even."""
+    light: str | None = None
+    """"studio" or a Radiance picture (.hdr) of the surroundings to be lit by; it stays fixed to the head."""
+    light_from: Path | None = None
+    """A photo of a face to be lit like."""
     fps: float | None = None
     """Frames per second; else 25, or the motion's own."""
     watermark: bool = True
@@ -64,6 +69,7 @@ class Animate:
         check_view(0.0, 0.0, check_even(self.size))
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
+        avatar = under_light(avatar, head, self.light, self.light_from)
         sound: Sound | None = None
         if self.speech is not None:
             motion, sound = self._spoken(self.speech, head)

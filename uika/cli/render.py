@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from uika.cli.lighting import under_light
 from uika.io.files import check_output
 
 
@@ -28,6 +29,10 @@ class Render:
     """Degrees; positive looks from above."""
     size: int = 512
     """Side of the picture in pixels."""
+    light: str | None = None
+    """"studio" or a Radiance picture (.hdr) of the surroundings to be lit by; it stays fixed to the head."""
+    light_from: Path | None = None
+    """A photo of a face to be lit like."""
     watermark: bool = True
     """Mark the picture invisibly as rendered; `uika verify` finds it."""
 
@@ -43,6 +48,7 @@ class Render:
         check_view(self.yaw, self.pitch, self.size)
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
+        avatar = under_light(avatar, head, self.light, self.light_from)
         check_renderer()
         camera = neutral_camera(avatar, self.yaw, self.pitch, self.size)
         rgb = render(avatar, HeadParameters.zeros(head), camera, head).rgb

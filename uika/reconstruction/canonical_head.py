@@ -7,6 +7,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from uika.canonical.light import (
+    LightSample,
+    absolute_light,
+    joined,
+    relative_lights,
+    remembered,
+    sample_light,
+    under_reference,
+)
 from uika.canonical.surface import SurfaceTexels, surface_texels
 from uika.head import HeadModel
 from uika.reconstruction.models import LoadedModel
@@ -56,6 +65,8 @@ class CanonicalHead:
         self._estimator, self._levels = loaded.estimator, list[Tensor]()
         self._session = Session(loaded.network, self.binding.texel, self._surface, keep, prior, growing=growing)
         self._run, self._on_template = loaded.run, loaded.on_template
+        self._lit: LightSample | None = None
+        self.light: Tensor | None = None  # [9,3] of the photo whose light the colours are kept under
 
     @torch.no_grad()
     def add(self, fit: Fit | None, images: Tensor, mattes: Tensor, report: Report) -> tuple[Tensor, ...]:
@@ -74,6 +85,9 @@ class CanonicalHead:
 
         with report.stage("correspondence"):
             uv, weight = self._located(fit, images, mattes)
+        if fit is not None and not self._on_template:
+            with report.stage("light"):
+                images = self._under_one_light(fit, images, uv[0], weight[:, None])
         with report.stage("reconstruction"):
             self._levels.append(levels(images, weight))
             weights = weight[None, :, None]
@@ -100,6 +114,17 @@ class CanonicalHead:
         assert fit is not None  # LoadedModel.needs_fit
         uv, valid, weight = pixel_uv(fit, self._head, mattes)
         return torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)[None], weight
+
+    def _under_one_light(self, fit: Fit, images: Tensor, uv: Tensor, weight: Tensor) -> Tensor:
+        """The photos as if taken under the light of the most frontal one of the first call."""
+        sample = sample_light(self._head, self.identity, self.static_offset, images, uv, weight)
+        known, before = (sample, 0) if self._lit is None else (joined(self._lit, sample), 1)
+        reference = 0 if before else int(fit.cameras.viewmat[:, 2, 2].argmin())
+        lights = relative_lights(known, reference)
+        if self.light is None:
+            self.light = absolute_light(known, lights, reference)
+        self._lit = remembered(known, lights)
+        return under_reference(images, uv, known, lights, before)
 
     def _prior(self, sums: Sums) -> Tensor:
         """Colours [3,S,S] for what no photo shows, from all photos pooled."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from uika.head import HeadModel
+from uika.head.light import COUNT
 from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
@@ -128,3 +129,21 @@ def released_view(photo: Photo) -> tuple[Tensor, Tensor]:
     from uika.photo.square_view import prepare_reference
 
     return prepare_reference(photo.original.permute(1, 2, 0).numpy(), photo.matte.numpy())
+
+
+def photo_light(path: str | Path, head: HeadModel) -> Tensor:
+    """The light [9,3] on the face in a photo of anyone, as `uika.head.light` has it; its mean is white.
+
+    Raises:
+        PhotoError: the photo cannot be read or shows no face; the message names it.
+    """
+    from uika.canonical.light import absolute_light, sample_light
+    from uika.fitting import pixel_uv
+
+    found = fit_files([path], head)
+    fit = found.fit
+    uv, valid, weight = pixel_uv(fit, head, found.mattes)
+    places = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
+    identity = fit.parameters.identity[0]
+    sample = sample_light(head, identity, fit.static_offset, found.images, places, weight[:, None])
+    return absolute_light(sample, torch.zeros(1, COUNT, 3), 0)

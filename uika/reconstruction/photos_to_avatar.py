@@ -134,4 +134,5 @@ def assemble(
             "photos": " ".join(digests),
         },
         skinning="released" if loaded.on_template else "surface",
+        light=canonical.light,
     )
