@@ -10,7 +10,7 @@ from tests.avatars import painted_avatar
 from uika.cli.lighting import under_light
 from uika.errors import UikaError
 from uika.head import load_head
-from uika.head.light import COUNT, from_environment
+from uika.head.light import from_environment
 
 
 def test_a_light_is_a_name_or_a_picture(tmp_path: Path) -> None:

@@ -142,6 +142,7 @@ def photo_light(path: str | Path, head: HeadModel) -> Tensor:
 
     found = fit_files([path], head)
     fit = found.fit
+    assert fit is not None
     uv, valid, weight = pixel_uv(fit, head, found.mattes)
     places = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
     identity = fit.parameters.identity[0]
