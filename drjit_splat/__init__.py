@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import reference
+    from ._harmonics import sh_colors
     from ._settings import Options
     from .frames import Frame, ProjectedFrame, project_frame
     from .ply import SplatFile, load_ply, save_ply
@@ -29,6 +30,7 @@ _HOMES = {
     "rasterization": "rasterizer",
     "save_ply": "ply",
     "save_spz": "spz",
+    "sh_colors": "_harmonics",
 }
 
 __all__ = [
@@ -46,6 +48,7 @@ __all__ = [
     "reference",
     "save_ply",
     "save_spz",
+    "sh_colors",
 ]
 
 

@@ -65,12 +65,18 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(terms, dim=-1)
 
 
+def sh_colors(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colours [N, D] = max(0, 0.5 + SH) of coefficients [N, K, D] in unit ``directions`` [N, 3] from the camera."""
+    import torch
+
+    count = (degree + 1) ** 2
+    values = torch.einsum("nk,nkd->nd", basis(directions, degree), coefficients[:, :count])
+    return (values + 0.5).clamp_min(0)
+
+
 def colors_seen_from(coefficients: Tensor, means: Tensor, viewmat: Tensor, degree: int) -> Tensor:
     """Colours [N, D] = max(0, 0.5 + SH) of coefficients [N, K, D] seen from the camera of ``viewmat`` [4, 4]."""
     import torch
 
     centre = torch.linalg.inv(viewmat)[:3, 3]
-    directions = torch.nn.functional.normalize(means - centre, dim=-1)
-    count = (degree + 1) ** 2
-    values = torch.einsum("nk,nkd->nd", basis(directions, degree), coefficients[:, :count])
-    return (values + 0.5).clamp_min(0)
+    return sh_colors(coefficients, torch.nn.functional.normalize(means - centre, dim=-1), degree)
