@@ -41,6 +41,8 @@ class Animate:
     """Language of the text for espeak-ng, such as de; else guessed from its letters."""
     motion_head: Path | None = None
     """The FLAME head that FLAME parameters belong to."""
+    save_motion: Path | None = None
+    """A file to write the motion to as well: .npz, .csv (Live Link), .json (ARKit), .bvh, or flame_param.npz."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
     """The video to write."""
     size: int = 512
@@ -64,9 +66,12 @@ class Animate:
         from uika.head import load_head
         from uika.io.video import check_even, write_video
         from uika.motion.presets import get_motion
+        from uika.motion.write import check_motion_output, write_motion
         from uika.safeguards import mark, picture_provenance
 
         check_view(0.0, 0.0, check_even(self.size))
+        if self.save_motion is not None:
+            check_motion_output(self.save_motion)
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
         avatar = under_light(avatar, head, self.light, self.light_from)
@@ -76,9 +81,13 @@ class Animate:
         elif self.video is None:
             source = None if self.motion_head is None else load_head(self.motion_head)
             motion = get_motion(self.motion, head, self.fps, source)
+        if self.video is None and self.save_motion is not None:
+            write_motion(motion, self.save_motion, head)
         check_renderer()
         if self.video is not None:
             motion = self._tracked(self.video, head)
+            if self.save_motion is not None:
+                write_motion(motion, self.save_motion, head)
         pictures = film(avatar, motion, head=head, size=self.size, progress=True)
         marked = map(mark, pictures) if self.watermark else pictures
         provenance = picture_provenance(avatar, watermark=self.watermark)

@@ -24,7 +24,7 @@ class Track:
     video: Positional[Path]
     """A video with one face."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("motion.npz")
-    """The motion file to write: .npz, or .csv and .json with ARKit activations."""
+    """The motion file to write: .npz, .csv or .json with ARKit activations, or .bvh."""
     preview: Path | None = None
     """A video to write that shows frames and tracked head side by side."""
     estimator: Path | None = None
@@ -32,11 +32,11 @@ class Track:
 
     def run(self) -> int:
         """Track and save."""
-        suffix = self.output.suffix.lower()
-        target = check_output(self.output, suffix if suffix in (".csv", ".json") else ".npz")
+        from uika.motion.write import check_motion_output, write_motion
+
+        target = check_motion_output(self.output)
         picture = None if self.preview is None else check_output(self.preview, ".mp4")
         from uika.head import load_head
-        from uika.motion import save_motion, write_csv, write_json
         from uika.tracking import track_video, write_preview
 
         head = load_head()
@@ -46,11 +46,7 @@ class Track:
 
             place = EstimatedLandmarks(self.estimator, head)
         found = track_video(self.video, head, progress=True, place=place)
-        if suffix == ".npz":
-            save_motion(found.motion, target, head)
-        else:
-            write = write_csv if suffix == ".csv" else write_json
-            write(found.motion, target, head.expression_names)
+        write_motion(found.motion, target, head)
         if picture is not None:
             write_preview(found, self.video, picture, head, progress=True)
         print(f"wrote {target}: {describe(found)}")

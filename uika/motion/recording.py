@@ -175,7 +175,7 @@ def from_angles(angles: Tensor) -> Tensor:
         torch.zeros(len(angles), 3).index_copy(1, torch.tensor([axis]), angles[:, [k]])
         for k, axis in enumerate((1, 0, 2))
     )
-    return _axis_angle(rodrigues(yaw) @ rodrigues(pitch) @ rodrigues(roll))
+    return axis_angles(rodrigues(yaw) @ rodrigues(pitch) @ rodrigues(roll))
 
 
 def to_angles(rotation: Tensor) -> Tensor:
@@ -187,7 +187,8 @@ def to_angles(rotation: Tensor) -> Tensor:
     return torch.stack((yaw, torch.asin((-m[:, 1, 2]).clamp(-1, 1)), roll), -1)
 
 
-def _axis_angle(matrix: Tensor) -> Tensor:
+def axis_angles(matrix: Tensor) -> Tensor:
+    """Axis-angle vectors [T,3] of rotations [T,3,3]."""
     twist = torch.stack(
         (matrix[:, 2, 1] - matrix[:, 1, 2], matrix[:, 0, 2] - matrix[:, 2, 0], matrix[:, 1, 0] - matrix[:, 0, 1]), -1
     )
