@@ -24,6 +24,10 @@ class View:
     """orbit, talk, expressions or a motion file, to play."""
     video: Path | None = None
     """A video to be driven by, or the number of a camera (0 is the first) to follow live."""
+    live_link: int | None = None
+    """The UDP port on which Live Link Face's packets are taken and followed; the app sends to 11111."""
+    listen: str = "127.0.0.1"
+    """The address of this machine on which they are taken; 0.0.0.0 lets a phone in the same network reach it."""
     count: int | None = None
     """Show at most so many Gaussians."""
     port: int = 8080
@@ -35,12 +39,16 @@ class View:
         """Serve until interrupted."""
         if not 1024 <= self.port <= 65535:
             raise UikaError(f"port must lie between 1024 and 65535, not {self.port}")
+        if self.live_link is not None and (self.video is not None or not 1 <= self.live_link <= 65535):
+            raise UikaError("--live-link takes a port between 1 and 65535, and no --video beside it")
+        if self.listen != "127.0.0.1" and self.live_link is None:
+            raise UikaError("--listen goes with --live-link; the page itself stays on 127.0.0.1")
         from uika.avatar import Avatar
         from uika.avatar.rendering import check_renderer
         from uika.export import thinned
         from uika.head import load_head
         from uika.motion.presets import get_motion
-        from uika.viewer import CameraFace, Viewer
+        from uika.viewer import CameraFace, LiveLinkFace, Viewer
 
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
@@ -54,7 +62,10 @@ class View:
             from uika.tracking import track_video
 
             motion = track_video(self.video, head, progress=True).motion
-        camera = None if number is None else CameraFace(number, head)
+        camera: CameraFace | LiveLinkFace | None = None if number is None else CameraFace(number, head)
+        if self.live_link is not None:
+            camera = LiveLinkFace(head, self.live_link, self.listen)
+            print(f"listening for Live Link Face on {':'.join(map(str, camera.place))} (UDP)", flush=True)
         with Viewer(avatar, head, motion, self.port, camera=camera, watermark=self.watermark) as viewer:
             print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
             while True:

@@ -3,6 +3,7 @@
 from uika.viewer.camera import CameraFace
 from uika.viewer.controls import Controls
 from uika.viewer.live import LiveSplats
+from uika.viewer.live_link import LiveLinkFace
 from uika.viewer.page import Viewer
 
-__all__ = ["CameraFace", "Controls", "LiveSplats", "Viewer"]
+__all__ = ["CameraFace", "Controls", "LiveLinkFace", "LiveSplats", "Viewer"]

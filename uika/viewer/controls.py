@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 
@@ -13,6 +14,20 @@ from uika.head import HeadModel, HeadParameters
 _GROUPS = {"Brows": ("brow",), "Eyes": ("eye",), "Jaw and tongue": ("jaw", "tongue"), "Mouth": ("mouth",)}
 _OTHERS = "Cheeks and nose"
 _JAW_RADIANS = 0.35  # of a jaw joint that is wide open
+
+
+class LiveFace(Protocol):
+    """What brings a face live: a camera, or packets of a phone."""
+
+    @property
+    def status(self) -> str:
+        """What is going on, for the user."""
+
+    def newest(self) -> HeadParameters | None:
+        """The newest pose; None if it was handed out before."""
+
+    def stop(self) -> None:
+        """End it."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from uika.head import HeadModel, HeadParameters
 from uika.io.video import to_bytes
 from uika.motion import Motion
 from uika.safeguards import mark
-from uika.viewer.camera import CameraFace
+from uika.viewer.controls import LiveFace
 from uika.viewer.live import UNITS, LiveSplats
 from uika.viewer.painting import Painting
 from uika.viewer.panels import IdentityPanel, MotionPanel, PosePanel
@@ -42,7 +42,7 @@ class Viewer:
         motion: Motion | None = None,
         port: int = 8080,
         *,
-        camera: CameraFace | None = None,
+        camera: LiveFace | None = None,
         watermark: bool = True,
     ) -> None:
         """Start the server on 127.0.0.1.

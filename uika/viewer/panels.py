@@ -10,8 +10,7 @@ from torch import Tensor
 
 from uika.head import HeadModel
 from uika.motion import Motion
-from uika.viewer.camera import CameraFace
-from uika.viewer.controls import Controls, action_groups
+from uika.viewer.controls import Controls, LiveFace, action_groups
 
 _RANGES = {"turn": 60, "nod": 30, "tilt": 30, "gaze_left": 30, "gaze_down": 20}  # degrees
 _IDENTITY_SLIDERS = 8
@@ -85,7 +84,7 @@ class IdentityPanel:
 class MotionPanel:
     """Play, pause and scrub a motion, or follow a camera."""
 
-    def __init__(self, gui: Any, motion: Motion, camera: CameraFace | None, moved: Callable[[], None]) -> None:
+    def __init__(self, gui: Any, motion: Motion, camera: LiveFace | None, moved: Callable[[], None]) -> None:
         """Add the folder."""
         self._motion, self._camera = motion, camera
         self._frame, self._began = -1, 0.0  # a frame below 0: the sliders count
@@ -117,7 +116,7 @@ class MotionPanel:
         self._frame = place
         return True
 
-    def camera(self) -> CameraFace | None:
+    def camera(self) -> LiveFace | None:
         """The camera, if it is to be followed."""
         if self._camera is None:
             return None
