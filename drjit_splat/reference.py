@@ -1,12 +1,11 @@
 """Float64 torch oracle of the rasterizer: the definition of the image, differentiable by autograd.
 
-It evaluates every (pixel, splat) pair, so keep scenes small (500 splats on 64x64 pixels take about a second). Nothing
-of the kernels is shared except `constants.py`, the argument checks and the spherical harmonics.
+It evaluates every (pixel, splat) pair, so keep scenes with gradients small (500 splats on 64x64 pixels take about a
+second). Nothing of the kernels is shared except `constants.py`, the argument checks and the spherical harmonics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +16,13 @@ from . import constants as c
 from ._compat import settings_of
 from ._harmonics import colors_seen_from
 from ._inputs import Splats, check_finite, check_shapes, finish
+from ._reference_batches import batched, stacked
+from ._reference_large import blend_large
 from ._reference_lens import see, within_lens
 from ._rotations import quats_to_rotations
 from ._settings import Options, Settings
+
+LARGE = 1 << 25  # (pixel, splat) pairs beyond which images without gradients are blended a few splats at a time
 
 
 @dataclass(frozen=True)
@@ -140,12 +143,12 @@ def raw_alphas(projection: Projection, settings: Settings, order: Tensor) -> Ten
 
 def blend(
     projection: Projection, features: Tensor, settings: Settings, order: Tensor | None, decisions: Decisions | None
-) -> tuple[Tensor, Tensor, Decisions, Tensor]:
+) -> tuple[Tensor, Tensor, Decisions | None, Tensor]:
     """Blend features [N, D] front to back.
 
     Returns:
-        The sums [H, W, D], the coverage [H, W, 1], the decisions taken and, for each pixel [H, W], the relative
-        distance of its closest decision to its threshold.
+        The sums [H, W, D], the coverage [H, W, 1], the decisions taken (unless they are too many) and, for each pixel
+        [H, W], the relative distance of its closest decision to its threshold.
     """
     p = projection
     if decisions is not None:
@@ -154,6 +157,13 @@ def blend(
         order = torch.argsort(p.depths.detach(), stable=True) if order is None else order
         order = order[p.visible[order]]
     xs, ys = _pixel_centres(settings, p.means2d)
+    shape = (settings.height, settings.width)
+    followed = any(t.requires_grad for t in (p.means2d, p.covariance, p.opacities, features))
+    if decisions is None and not followed and len(order) * xs.numel() > LARGE:
+        names = ("means2d", "covariance", "determinant", "opacities", "span")
+        splats = {name: getattr(p, name)[order] for name in names} | {"features": features[order]}
+        sums, coverage, margin = blend_large(splats, torch.cat([xs, ys]).T, settings)
+        return sums.reshape(*shape, -1), coverage.reshape(*shape, 1), None, margin.reshape(shape)
     raw = raw_alphas(p, settings, order)
 
     alpha_min, alpha_max, t_min = settings.options.alpha_min, settings.alpha_max, settings.options.transmittance_min
@@ -183,7 +193,6 @@ def blend(
         near = torch.minimum((free / alpha_min - 1).abs(), (free / alpha_max - 1).abs())
         near = torch.minimum(near, torch.where(hit, (after / t_min - 1).abs(), torch.full_like(after, torch.inf)))
         margin = torch.where(reached, near, torch.full_like(near, torch.inf)).amin(0)
-    shape = (settings.height, settings.width)
     taken = Decisions(order, keep, clamped)
     return sums.reshape(*shape, -1), coverage.reshape(*shape, 1), taken, margin.reshape(shape)
 
@@ -216,10 +225,11 @@ def rasterization(
         decisions: `meta["decisions"]` of an earlier call: keep its order, skips and clamps whatever the values are.
 
     Returns:
-        colors [C, H, W, D], alphas [C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii`, `visible` (as in
-        the fast path), `decisions` (one per camera), `margin` [C, H, W]: how close, relatively, the pixel's closest
-        threshold is, and `culling_margin` [C, N], the same of each splat's visibility; compare only what exceeds the
-        rounding error of the tested code.
+        colors [..., C, H, W, D], alphas [..., C, H, W, 1] in float64 and meta with `means2d`, `depths`, `radii` and
+        `visible` (as in the fast path, not packed), `decisions` (one a camera; None where more than `LARGE` pairs were
+        blended without gradients), `margin` [..., C, H, W]: how close, relatively, the pixel's closest threshold is,
+        and `culling_margin` [..., C, N], the same of each splat's visibility; compare only what exceeds the rounding
+        error of the tested code.
 
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
@@ -239,7 +249,7 @@ def rasterization(
     if not given.batch:
         return found[0]
     colors_, alphas, metas = zip(*found, strict=True)
-    return _stacked(colors_, given), _stacked(alphas, given), _batched(metas, given)
+    return stacked(colors_, given), stacked(alphas, given), batched(metas, given)
 
 
 def images(
@@ -280,17 +290,3 @@ def images(
         "margin": torch.stack([margin for _, _, margin in metas]),
     }
     return torch.stack(images), torch.stack(coverages), meta
-
-
-def _stacked(parts: Sequence[Tensor], given: Splats) -> Tensor:
-    return torch.stack(list(parts)).view(*given.batch, *parts[0].shape)
-
-
-def _batched(metas: Sequence[dict[str, Any]], given: Splats) -> dict[str, Any]:
-    """Meta of all elements of the batch; `decisions` is a flat list of their cameras'."""
-    return {
-        name: [d for meta in metas for d in meta[name]]
-        if name == "decisions"
-        else _stacked([meta[name] for meta in metas], given)
-        for name in metas[0]
-    }

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 
-from drjit_splat import reference
+from drjit_splat import _reference_large, reference
 
 from .common import one_splat, random_scene
 
@@ -62,3 +63,18 @@ def test_blending_stops_before_the_splat_that_makes_a_pixel_opaque() -> None:
     many["opacities"] = torch.tensor([0.9, 0.99, 0.95, 0.5])  # after two 1e-3 is left, a third would leave 5e-5
     _, alpha, _ = reference.rasterization(**(scene | many), width=16, height=16)
     assert float(alpha[0, 8, 8, 0]) == pytest.approx(1 - 1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"semantics": "inria"}, {"render_mode": "RGB+ED"}])
+def test_many_pairs_are_blended_in_parts(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = random_scene(count=400, width=40, height=24)
+    scene["opacities"] = scene["opacities"].clamp_min(0.3)  # so that pixels stop
+    image, alpha, meta = reference.rasterization(**scene, width=40, height=24, **options)
+    monkeypatch.setattr(reference, "LARGE", 1)
+    monkeypatch.setattr(_reference_large, "PIXELS", 100)
+    parts, part_alpha, part_meta = reference.rasterization(**scene, width=40, height=24, **options)
+    assert float((image - parts).abs().max()) < 1e-12 and float((alpha - part_alpha).abs().max()) < 1e-12
+    assert part_meta["decisions"] == [None] and (alpha > 1 - 1e-3).any()
+    assert (part_meta["margin"] >= meta["margin"] - 1e-9).all()
+    scene["means"].requires_grad_()
+    assert reference.rasterization(**scene, width=40, height=24, **options)[0].requires_grad
