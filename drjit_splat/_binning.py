@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -85,11 +86,23 @@ def depth_order(be: Backend, projected: Projected) -> Any:
     return _sorted_by(be, keys, (int(high[0]) - int(low[0])).bit_length())
 
 
+def available_memory() -> int | None:
+    """Bytes that could be had, counting what the system keeps of files, which it gives back; None if unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        lines = []
+    found = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    if found:
+        return 1024 * found[0]
+    if "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
 def check_pairs(pairs: int, be: Backend) -> None:
     """Raise MemoryError when the lists of `pairs` (tile, splat) pairs could not be indexed or stored."""
-    available = None
-    if be.is_cpu and "SC_AVPHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    available = available_memory() if be.is_cpu else None
     needed = pairs * BYTES_PER_PAIR
     if pairs > c.MAX_PAIRS or (available is not None and needed > available):
         raise MemoryError(

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from drjit_splat import rasterization
+from drjit_splat._binning import available_memory
 from drjit_splat.llvm import MIN_VERSION, candidates, library_version, require
 
 from .common import one_splat
@@ -88,3 +89,13 @@ def test_import_is_light() -> None:
     code = "import sys, drjit_splat; print(sorted({'torch', 'drjit', 'mitsuba'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(
+    not Path("/proc/meminfo").exists(), reason="skipped: the system does not tell of its memory this way"
+)
+def test_memory_that_holds_files_counts_as_available() -> None:
+    told = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    available = available_memory()
+    assert available is not None
+    assert abs(available - 1024 * int(told["MemAvailable"].split()[0])) < 2**30
