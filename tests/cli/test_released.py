@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from tests.exports import bare_flame
+from tests.exports import bare_flame, write_export, write_flame
 from tests.heads import released_parity
 from tests.model.released_files import SMALL
 from tests.model.restatement import Restatement
@@ -240,3 +240,22 @@ def test_the_list_of_weights_says_what_each_file_unlocks(capsys: pytest.CaptureF
     assert printed.count("unlocks  ") == 5
     for words in ("--model uika.safetensors --head flame.npz", "--estimator fuvt_15k.safetensors", "--preset base"):
         assert words in printed
+
+
+@pytest.mark.slow
+def test_released_weights_are_evaluated_and_moved_by_other_motions(
+    folder: Path, avatar: Avatar, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    del avatar
+    head = ["--head", str(write_flame(tmp_path / "flame.npz"))]
+    data = write_export(tmp_path / "data" / "306_EMO-1_v16", cameras=1).parent
+    words = ["--model", str(folder / "uika.safetensors"), *head, "--correspondence", "exact", "--views", "1,2"]
+    assert main(["evaluate", "--data", str(data), *words, "--size", "96", "-o", str(tmp_path / "report")]) == 0
+    said = capsys.readouterr().out
+    assert "2 results made" in said and "model released (uika.safetensors), sha256" in said
+    (tmp_path / "face.csv").write_text("Timecode,BlendshapeCount,jawOpen\n00:00:00:00.0,1,0.0\n00:00:00:01.0,1,0.8\n")
+    for motion in ("talk", str(tmp_path / "face.csv")):
+        film_file = tmp_path / "moved.mp4"
+        given = ["--motion", motion, *head, "--size", "64", "-o", str(film_file)]
+        assert main(["animate", str(folder / "me.safetensors"), *given]) == 0, capsys.readouterr().err
+        assert film_file.stat().st_size > 1000

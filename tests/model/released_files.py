@@ -126,10 +126,14 @@ def write(folder: Path, tensors: Mapping[str, Tensor], name: str = "uika.safeten
     return path
 
 
-def write_full(path: Path) -> None:
-    """The released file at its full size, 4.5 GiB, tensor by tensor."""
+def write_full(path: Path, tables: Mapping[str, Tensor] | None = None) -> None:
+    """The released file at its full size, 4.5 GiB, tensor by tensor; `tables` take the place of random ones."""
     kinds = {name: ("F32", shape) for name, shape in released_shapes(PRESETS["paper"], ESTIMATORS["paper"]).items()}
-    kinds |= {f"renderer.flame_model.{name}": entry for name, entry in FULL_TABLES.items()}
+    types = {torch.float32: "F32", torch.int64: "I64", torch.bool: "BOOL"}
+    if tables is None:
+        kinds |= {f"renderer.flame_model.{name}": entry for name, entry in FULL_TABLES.items()}
+    else:
+        kinds |= {name: (types[value.dtype], tuple(value.shape)) for name, value in tables.items()}
     width = {"F32": 4, "I64": 8, "BOOL": 1}
     header, place = {}, 0
     for name, (kind, shape) in kinds.items():
@@ -143,7 +147,9 @@ def write_full(path: Path) -> None:
         file.write(struct.pack("<Q", len(text)) + text)
         for name, (kind, shape) in kinds.items():
             count = math.prod(shape)
-            if kind == "F32":
+            if tables is not None and name in tables:
+                value = tables[name]
+            elif kind == "F32":
                 noise = block.repeat(-(-count // len(block)))[:count].view(shape)
                 value = 0.1 * noise if name.startswith("renderer.") else shaped(name, noise)
             elif kind == "BOOL":
