@@ -93,6 +93,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_ply(place / "scene.ply", posed_splats(avatar, head).half_turned())
     write_wav(place / "voice.wav", spoken(SENTENCE).samples)
     (place / "words.txt").write_text("Hello, nice to meet you.")
+    for system in ("ours", "other"):
+        (place / "clips" / system).mkdir(parents=True)
+        shutil.copy(PORTRAIT, place / "clips" / system / "anna.jpg")
+    shutil.copy(PORTRAIT, place / "drawn.png")
     view = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 256, "height": 256}
     (place / "cameras.json").write_text(json.dumps([view] * 4))
     write_colmap(place / "garden", binary=True)
