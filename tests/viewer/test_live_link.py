@@ -46,8 +46,10 @@ def test_layout_is_the_published_one() -> None:
     values[52:55] = 0.3, -0.2, 0.1
     by_hand = (
         b"\x06\x00\x00\x00\x07PHONE-1\x00\x00\x00\x02me"
-        + struct.pack(">i", 90) + struct.pack(">f", 0.5) + struct.pack(">ii", 60, 1) + b"\x3d" + values.astype(">f4").tobytes()
-    )  # fmt: skip
+        + struct.pack(">ifii", 90, 0.5, 60, 1)
+        + b"\x3d"
+        + values.astype(">f4").tobytes()
+    )
     found = read_packet(by_hand)
     assert (found.device, found.subject, found.seconds) == ("PHONE-1", "me", pytest.approx(90.5 / 60))
     named = dict(zip(ARKIT_ACTIONS, found.actions.tolist(), strict=True))
