@@ -13,6 +13,7 @@ from tests.train.common import PaintedPerson
 from uika.data import DataError, open_capture
 from uika.data.datasets import find_people
 from uika.data.head_crop import head_square
+from uika.data.labels import check_parameters
 from uika.data.views import View
 from uika.head import load_head
 
@@ -116,3 +117,26 @@ def test_many_frames_are_opened_in_seconds(folder: Path, tmp_path: Path) -> None
     start = time.process_time()
     assert len(open_capture(copy)) == 10_000
     assert time.process_time() - start < 3
+
+
+def test_captures_that_cannot_be_trained_on_say_why(folder: Path, tmp_path: Path) -> None:
+    sample = open_capture(folder).sample(0)
+    with pytest.raises(
+        DataError, match=r"_00000_222200036: has 300 identities, 100 expressions and 5,023 vertices, but"
+    ) as caught:
+        check_parameters(View(sample, 64), load_head())
+    assert "give the capture's own with --head" in str(caught.value)
+    bare = write_export(tmp_path / "306_D", frames=1, cameras=1)
+    content = json.loads((bare / "transforms.json").read_text())
+    del content["frames"][0]["flame_param_path"]
+    (bare / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match="has no head parameters; track the capture first"):
+        check_parameters(View(open_capture(bare).sample(0), 64), bare_flame())
+
+
+def test_offsets_that_move_with_time_are_said_to_be_unused(tmp_path: Path) -> None:
+    copy = write_export(tmp_path / "306_E", frames=1, cameras=1)
+    path = copy / "flame_param/00000.npz"
+    arrays = dict(np.load(path))
+    np.savez(path, **arrays, dynamic_offset=np.zeros((1, 5143, 3)))
+    assert any("'dynamic_offset' of its frames is not used" in note for note in open_capture(copy).notes)
