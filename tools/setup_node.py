@@ -10,11 +10,11 @@ from pathlib import Path
 from tools import apt_get
 
 FOLDER = Path(__file__).resolve().parent.parent / "out" / "node"
-PACKAGES = ("three@0.180.0", "gltf-validator@2.0.0-dev.3.10")
+PACKAGES = ("three@0.180.0", "@pixiv/three-vrm@3.5.5", "gltf-validator@2.0.0-dev.3.10")
 
 
 def main() -> None:
-    names = [package.partition("@")[0] for package in PACKAGES]
+    names = [package.rpartition("@")[0] for package in PACKAGES]
     if all((FOLDER / "node_modules" / name).is_dir() for name in names):
         print(f"node: {FOLDER}")
         return

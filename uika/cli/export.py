@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from uika.head import HeadModel
     from uika.motion import Motion
 
-_KINDS = (".ply", ".splat", ".glb", ".obj", ".html", ".npz")
+_KINDS = (".ply", ".splat", ".glb", ".obj", ".vrm", ".html", ".npz")
 _POSED = (".ply", ".splat", ".glb", ".obj")  # hold one pose
 _LARGEST = 8192  # texels; more than most graphics cards hold
 _TURNED = (".ply", ".splat", "")
@@ -32,7 +32,7 @@ class Export:
     avatar: Positional[Path]
     """The avatar file."""
     output: Annotated[Path, arg(aliases=["-o"])]
-    """.ply, .splat, .glb, .obj, .html, .npz, or a folder."""
+    """.ply, .splat, .glb, .obj, .vrm, .html, .npz, or a folder."""
     motion: str | None = None
     """orbit, talk, expressions or a motion file; an .html plays talk if left out."""
     frame: int | None = None
@@ -65,7 +65,7 @@ class Export:
             raise UikaError(f"--frame must lie between 0 and {len(motion) - 1}, not {self.frame}")
         if self.count is not None:
             avatar = thinned(avatar, self.count)
-        if self.mesh or kind == ".obj":
+        if self.mesh or kind in (".obj", ".vrm"):
             said = self._write_mesh(kind, avatar, head, motion)
         else:
             said = f"{len(avatar):,} Gaussians{self._write(kind, avatar, head, motion)}"
@@ -83,6 +83,8 @@ class Export:
             check_output(self.output, kind)
         if self.mesh and (kind != ".glb" or self.frame is not None or self.count is not None):
             raise UikaError("--mesh needs a .glb to write, and neither --frame nor --count")
+        if kind == ".vrm" and self.motion is not None:
+            raise UikaError(f"{self.output}: a VRM avatar has no motion of its own; leave --motion out")
         if not 16 <= self.texture <= _LARGEST:
             raise UikaError(f"--texture must lie between 16 and {_LARGEST}, not {self.texture}")
         if self.frame is not None and (self.motion is None or kind not in _POSED):
@@ -101,6 +103,9 @@ class Export:
             params = None if motion is None else motion.parameters(avatar.identity)[self.frame]
             beside = export.write_obj(self.output, avatar, head, params, self.texture)
             return f"{len(head.faces):,} triangles, with {', '.join(path.name for path in beside)}"
+        if kind == ".vrm":
+            mesh = export.write_vrm(self.output, avatar, head, self.output.stem, self.texture)
+            return f"{len(head.faces):,} triangles, {len(mesh.morphs)} expressions, VRM 1.0"
         mesh = export.write_rigged_glb(self.output, avatar, head, motion, self.texture)
         played = "" if motion is None else f", {len(motion)} frames at {motion.fps:g} a second"
         size = self.output.stat().st_size / 1e6

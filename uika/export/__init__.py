@@ -8,6 +8,7 @@ from uika.export.ply import write_bound_ply, write_ply, write_ply_sequence
 from uika.export.rigged import write_rigged_glb
 from uika.export.splats import Splats, posed_splats, thinned
 from uika.export.tables import write_npz
+from uika.export.vrm import write_vrm
 
 __all__ = [
     "Splats",
@@ -26,4 +27,5 @@ __all__ = [
     "write_ply_sequence",
     "write_rigged_glb",
     "write_splat",
+    "write_vrm",
 ]

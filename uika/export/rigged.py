@@ -21,7 +21,7 @@ from uika.motion import Motion
 
 UNLIT = "KHR_materials_unlit"  # the texture holds the photos' own light
 _CLAMP = 33071
-_MESH_NODE = len(JOINT_NAMES)  # joints come first
+MESH_NODE = len(JOINT_NAMES)  # joints come first
 
 
 def write_rigged_glb(
@@ -82,7 +82,7 @@ def add_mesh(file: Glb, mesh: SkinnedMesh, textures: list[NDArray[np.uint8]]) ->
     file.document.update(
         extensionsUsed=[UNLIT],
         scene=0,
-        scenes=[{"nodes": [0, _MESH_NODE]}],
+        scenes=[{"nodes": [0, MESH_NODE]}],
         nodes=[*_joint_nodes(mesh), {"name": "head", "mesh": 0, "skin": 0}],
         meshes=[
             {
@@ -119,7 +119,7 @@ def add_animation(file: Glb, mesh: SkinnedMesh, motion: Motion) -> None:
     curves = [(node, "rotation", quaternions(turn)) for node, turn in enumerate(turns) if bool((turn != 0).any())]
     if bool((motion.translation != 0).any()):
         curves.append((0, "translation", mesh.joints[0] + motion.translation.numpy()))
-    curves.append((_MESH_NODE, "weights", motion.expression.numpy().reshape(-1)))
+    curves.append((MESH_NODE, "weights", motion.expression.numpy().reshape(-1)))
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
     for node, kind, values in curves:
