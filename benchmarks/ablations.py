@@ -69,7 +69,7 @@ def config_of(name: str, steps: int) -> TrainConfig:
 @torch.no_grad()
 def judge(model: Path, config: TrainConfig, people: Stored, count: int) -> list[dict[str, Any]]:
     """Scores of a model for each person and number of photos; photos and targets depend on the person alone."""
-    head = load_head()
+    head = load_head().without_bust
     plain = replace(config, augment=False, targets=4, losses=replace(config.losses, atlas=0.0))
     task, maker = ReconstructionTask(plain, head), ItemMaker(people, plain)
     task.model.load_state_dict(load_checkpoint(model).state_dict())

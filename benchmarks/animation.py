@@ -22,7 +22,8 @@ from drjit_splat.profiling import profile
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.frame_renderer import FrameRenderer, film
-from uika.avatar.rendering import frames, motion_cameras
+from uika.avatar.framing import motion_cameras
+from uika.avatar.rendering import frames
 from uika.head import HeadModel, load_head
 from uika.io.video import to_bytes
 from uika.motion import Motion

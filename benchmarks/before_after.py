@@ -10,7 +10,8 @@ from PIL import Image
 
 from benchmarks.harness import RESULTS
 from uika.assets import PORTRAIT
-from uika.avatar.rendering import neutral_camera, render
+from uika.avatar.framing import neutral_camera
+from uika.avatar.rendering import render
 from uika.head import HeadParameters, load_head
 from uika.io.files import replacing
 from uika.io.video import to_bytes
@@ -26,7 +27,7 @@ def main() -> None:
     parser.add_argument("--model", default="tiny")
     parser.add_argument("-o", "--output", type=Path, default=RESULTS / "before_after.png")
     options = parser.parse_args()
-    head = load_head()
+    head = load_head().without_bust
     rows = []
     for model in ("none", options.model):
         avatar = reconstruct([options.photo], head, model).avatar

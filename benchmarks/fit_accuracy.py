@@ -158,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--resume", type=Path, help="folder that keeps each person's figures for a later run")
     arguments = parser.parse_args(argv)
-    head = load_head()
+    head = load_head().without_bust
     tables: list[Table] = []
     for seed in range(arguments.people):
         refine = seed < arguments.refined

@@ -211,7 +211,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--photos", type=int, nargs="+", default=[1, 2, 4], help="of the known head, up to 4")
     arguments = parser.parse_args(argv)
     arguments.output.mkdir(parents=True, exist_ok=True)
-    head = load_head()
+    head = load_head().without_bust
     result = reconstruct([PORTRAIT], head)
     portrait, picture = portrait_figures(result, head)
     mesh = mesh_figures(result.avatar, head)

@@ -178,7 +178,7 @@ def main() -> None:
     parser.add_argument("--name", default="learned", help="of the result files")
     parser.add_argument("--rows", type=Path, default=Path("out/learned.jsonl"), help="finished rows")
     options = parser.parse_args()
-    head = load_head()
+    head = load_head().without_bust
     models = {"aggregation only": load_model("none"), "trained": load_model(options.model)}
     views = [int(part) for part in options.views.split(",")]
     options.rows.parent.mkdir(parents=True, exist_ok=True)

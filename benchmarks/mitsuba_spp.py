@@ -69,7 +69,7 @@ def draw(rows: list[dict[str, Any]], resident: list[float], renders: int) -> Non
 
 def quality(size: int, reference_spp: int) -> list[dict[str, Any]]:
     """Time and sRGB error of each number of samples, studio light, inside the mask."""
-    head = load_head()
+    head = load_head().without_bust
     person = sample_person(3, head)
     albedo, rough = paint(person, head, 512)
     vertices = pose_vertices(
@@ -107,7 +107,7 @@ def quality(size: int, reference_spp: int) -> list[dict[str, Any]]:
 
 def memory(renders: int) -> list[float]:
     """Resident megabytes at ten moments of many renders of a moving head."""
-    head = load_head()
+    head = load_head().without_bust
     camera = look_at(distance=0.9, size=64)
     curve = []
     for index in range(renders):

@@ -141,7 +141,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--name", default="model_operations", help="of the result files")
     options = parser.parse_args(argv)
     config = PRESETS[options.preset]
-    valid = uv_texels(load_head(), config.map_size).texel
+    valid = uv_texels(load_head().without_bust, config.map_size).texel
     counted = Counted(options.preset, len(valid))
     patches = (config.image_size // config.backbone.patch_size) ** 2
     dense = Kept(patches, patches, config.token_grid**2)

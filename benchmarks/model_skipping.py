@@ -210,7 +210,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--name", default="model_skipping", help="of the result files")
     options = parser.parse_args(argv)
-    head, loaded = load_head(), load_model(options.model)
+    head, loaded = load_head().without_bust, load_model(options.model)
     cases = [around(loaded, head)]
     if options.people:
         cases += people(loaded, head, options.people, max(*options.views, options.photos), options.count)

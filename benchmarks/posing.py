@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=60)
     arguments = parser.parse_args(argv)
     torch.set_num_threads(2)
-    head = load_head()
+    head = load_head().without_bust
     figures = timing(head, arguments.repeats)
     worth, picture = skinning(head)
     figures.update(worth)

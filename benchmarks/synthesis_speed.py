@@ -86,7 +86,7 @@ def throughput(size: int, identities: int, frames: int) -> dict[str, float]:
 
 def stages(size: int, frames: int) -> dict[str, float]:
     """CPU milliseconds per image of each stage, one after the other."""
-    head = load_head()
+    head = load_head().without_bust
     person = sample_person(3, head)
     lighting = sample_lighting(np.random.default_rng(2))
     head_scene = lit_scene(head, lighting.light)

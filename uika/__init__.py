@@ -12,7 +12,8 @@ from uika._version import __version__
 
 if TYPE_CHECKING:
     from uika.avatar import Avatar, AvatarError
-    from uika.avatar.rendering import Rendering, frames, neutral_camera, render
+    from uika.avatar.framing import neutral_camera
+    from uika.avatar.rendering import Rendering, frames, render
     from uika.errors import UikaError
     from uika.head import Camera, HeadModel, HeadParameters, load_head
     from uika.io.sound import Sound, read_sound
@@ -40,7 +41,7 @@ _HOMES = {
     "get_motion": "motion.presets",
     "load_head": "head",
     "load_motion": "motion",
-    "neutral_camera": "avatar.rendering",
+    "neutral_camera": "avatar.framing",
     "read_sound": "io.sound",
     "reconstruct": "reconstruction",
     "render": "avatar.rendering",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +54,7 @@ def _cell(value: float, bad: bool = False) -> str:
 
 def _summary(reports: list[ViewReport]) -> str:
     rows = []
-    for name, limit in LIMITS.items():
+    for name, limit in reports[0].limits.items():
         values = np.array([getattr(report, name) for report in reports])
         rows.append(
             [f"<td>{name}</td>", *(_cell(float(v)) for v in (np.median(values), values.min(), values.max(), limit))]
@@ -73,6 +72,6 @@ def _gradients(gradients: GradientReport) -> str:
 
 
 def _views(reports: list[ViewReport]) -> str:
-    names = [field.name for field in fields(ViewReport)][1:]
+    names = ["pose", "view", *LIMITS]
     rows = [[_cell(getattr(report, name), name in report.failures()) for name in names] for report in reports]
     return _table(names, rows)

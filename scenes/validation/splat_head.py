@@ -1,11 +1,11 @@
-"""A head's closed surface as splats."""
+"""A head's closed surface, its bust included, as splats."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from uika.head import Camera, HeadModel, HeadParameters, pose_gaussians, pose_vertices
+from uika.head import Camera, HeadModel, HeadParameters, pose_gaussians, pose_vertices, uv_texels
 
 TEXELS = 512
 
@@ -20,31 +20,34 @@ def texture(size: int = 512) -> Tensor:
 def splat_head(
     head: HeadModel, params: HeadParameters, channels: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Splat a head's closed surface.
+    """Splat a head's closed surface, with its bust where it has one.
 
     Args:
         head: the head model.
         params: one frame.
-        channels: [D,S,S] UV map of what to splat.
+        channels: [D,S,S] UV map of what to splat; a bust's tile repeats it.
         camera: one camera.
 
     Returns:
         The channels [H,W,D] divided by the coverage, the coverage [H,W] and the expected depth [H,W].
     """
     from drjit_splat import rasterization
-    from uika.canonical.surface import surface_texels
+    from uika.canonical.surface import closing_splats
 
-    surface, binding = surface_texels(head, params.identity.detach(), torch.zeros_like(head.template), TEXELS)
-    rest = HeadParameters.zeros(head).replace(identity=params.identity)
+    rest = pose_vertices(head, HeadParameters.zeros(head).replace(identity=params.identity))
+    tiles = [uv_texels(head, TEXELS, tile=tile) for tile in range(1 if head.bust is None else 2)]
+    still = rest.detach()
+    parts = [closing_splats(head, still, binding) for binding in tiles]
+    points, rotations, sizes = (torch.cat(part) for part in zip(*parts, strict=True))
     means, quats, scales = pose_gaussians(
-        surface.points[0],
-        surface.quats[0],
-        surface.scales[0],
-        pose_vertices(head, rest),
+        points,
+        rotations,
+        sizes,
+        rest,
         pose_vertices(head, params),
         head.faces,
-        binding.triangle,
-        binding.barycentric,
+        torch.cat([binding.triangle for binding in tiles]),
+        torch.cat([binding.barycentric for binding in tiles]),
     )
     values = torch.nn.functional.interpolate(channels[None], (TEXELS, TEXELS), mode="bilinear", antialias=True)[0]
     image, alpha, _ = rasterization(
@@ -52,7 +55,7 @@ def splat_head(
         quats,
         scales,
         torch.full((len(means),), 0.95),
-        binding.from_map(values).contiguous(),
+        torch.cat([binding.from_map(values) for binding in tiles]),
         camera.viewmat[None],
         camera.K[None],
         camera.width,

@@ -15,7 +15,7 @@ from uika import (
     write_png,
     write_video,
 )
-from uika.avatar.rendering import motion_cameras
+from uika.avatar.framing import motion_cameras
 from uika.cli.contact_sheet import contact_sheet
 from uika.errors import UikaWarning
 from uika.io.video import to_bytes

@@ -140,7 +140,7 @@ def test_usage_errors_exit_with_2(capsys):
 def test_doctor_names_versions_and_llvm(capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
-    assert torch.__version__.split("+")[0] in out and "LLVM" in out and "threads" in out and "builtin-1" in out
+    assert torch.__version__.split("+")[0] in out and "LLVM" in out and "threads" in out and "builtin-2" in out
 
 
 def test_doctor_fails_without_a_head_or_llvm(tmp_path):

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*tensorboard.*:DeprecationWarni
 
 
 def test_texture_holds_the_paint_of_every_view() -> None:
-    head, person = load_head(), PaintedPerson(3, views=6)
+    head, person = load_head().without_bust, PaintedPerson(3, views=6)
     texture = true_texture([View(person.sample(index), 64) for index in range(6)], 64)
     binding = uv_texels(head, 64)
     known = binding.from_map(texture[3:])[:, 0] > 0
@@ -35,7 +35,7 @@ def test_no_labels_no_texture() -> None:
 
 
 def test_atlas_loss_is_zero_for_the_truth_and_counts_known_texels_alone() -> None:
-    head = load_head()
+    head = load_head().without_bust
     task = ReconstructionTask(replace(CONFIG, losses=LossWeights(atlas=1.0)), head)
     size = MICRO.map_size
     texel = uv_texels(head, size).texel

@@ -23,7 +23,7 @@ FRONT = np.diag([1.0, -1.0, -1.0])
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def rest(model: FrameModel) -> Pose:

@@ -16,7 +16,7 @@ SIZE = 512
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def seen(head: HeadModel, yaw: float) -> tuple[Tensor, Tensor, float]:

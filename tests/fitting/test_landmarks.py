@@ -12,7 +12,7 @@ SIZE = 512
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def observe(head: HeadModel, yaws: list[float], seed: int, noise: float = 0.0) -> tuple[Tensor, HeadParameters]:

@@ -15,7 +15,7 @@ SIZE = 256
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def covered(head: HeadModel, vertices: Tensor, camera: Camera) -> Tensor:

@@ -22,7 +22,7 @@ YAWS = (-35.0, 0.0, 35.0)
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def turned(model: FrameModel) -> Pose:

@@ -97,14 +97,14 @@ def test_kinds_of_json(content: object, tmp_path: Path) -> None:
 def test_csv_round_trip(head: HeadModel, tmp_path: Path) -> None:
     motion = get_motion("expressions", head, 30.0)
     turning = torch.linspace(-0.4, 0.4, 3 * len(motion)).view(-1, 3)
-    motion = Motion(fps=30.0, **{**motion.tensors(), "rotation": turning})
+    motion = Motion(fps=30.0, **{**motion.tensors(), "neck": turning})
     path = tmp_path / "face.csv"
     write_csv(motion, path, head.expression_names)
     assert path.read_text().startswith("Timecode,BlendShapeCount,EyeBlinkLeft,EyeLookDownLeft")
     again = read_motion(path, head)
     assert again.fps == 30.0
     assert torch.equal(again.expression, motion.expression)
-    torch.testing.assert_close(rodrigues(again.rotation), rodrigues(motion.rotation), atol=1e-5, rtol=0)
+    torch.testing.assert_close(rodrigues(again.neck), rodrigues(motion.neck), atol=1e-5, rtol=0)
 
 
 def test_flame_parameters_round_trip(tmp_path: Path) -> None:

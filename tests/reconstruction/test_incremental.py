@@ -6,7 +6,8 @@ import torch
 from tests.agreement import assert_same_avatar
 from uika import GrowingAvatar, HeadModel, UikaError, load_head, reconstruct
 from uika.assets import PORTRAIT
-from uika.avatar.rendering import neutral_camera, render
+from uika.avatar.framing import neutral_camera
+from uika.avatar.rendering import render
 from uika.head import HeadParameters
 from uika.io.video import write_png
 from uika.photo import PhotoError

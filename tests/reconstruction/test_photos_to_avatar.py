@@ -10,14 +10,15 @@ from tests.agreement import assert_same_avatar
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
-from uika.head import HeadModel, HeadParameters, load_head, look_at, uv_texels
+from uika.head import HeadModel, HeadParameters, load_head, look_at, project, uv_texels
 from uika.model import build, save_checkpoint
 from uika.reconstruction import Reconstruction, Report, avatar_from_fit, load_model, reconstruct
+from uika.reconstruction.bust import wider_camera
 
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 @pytest.fixture(scope="module")
@@ -101,3 +102,35 @@ def test_two_photos_of_a_known_head(portrait: Reconstruction, head: HeadModel, t
     back = reconstruct(paths[::-1], head)
     assert [photo.sha256 for photo in back.photos] == [photo.sha256 for photo in result.photos]
     assert_same_avatar(back.avatar, result.avatar)
+
+
+def test_a_bust_is_added_to_an_unchanged_head(portrait: Reconstruction, head: HeadModel) -> None:
+    whole = load_head()
+    assert whole.bust is not None
+    result = reconstruct([PORTRAIT], whole)
+    avatar, count = result.avatar, len(portrait.avatar)
+    assert (avatar.head_id, avatar.bust_triangle) == ("builtin-2", whole.bust.face)
+    assert torch.equal(avatar.on_bust, torch.arange(len(avatar)) >= count)
+    for name in ("means", "quats", "scales", "opacities", "colors", "triangle", "barycentric"):
+        assert torch.equal(getattr(avatar, name)[:count], getattr(portrait.avatar, name)), name
+    assert torch.equal(avatar.identity, portrait.avatar.identity)
+    assert torch.equal(avatar.static_offset[: whole.bust.vertex], portrait.avatar.static_offset)
+    lifted = avatar.static_offset[whole.bust.vertex :].norm(dim=-1)
+    assert 0.02 < lifted.max() < 0.13
+    suit = avatar.colors[avatar.on_bust & (avatar.means[:, 2] > 0) & (avatar.means[:, 1] < -0.22)]
+    assert suit[:, 0].median() > 1.8 * suit[:, 2].median()  # an orange one
+
+
+def test_the_bust_covers_the_person_in_the_photo(head: HeadModel) -> None:
+    whole = load_head()
+    result = reconstruct([PORTRAIT], whole, "none")
+    photo, camera = result.photos[0], result.fit.cameras[0]
+    assert photo.bust is not None
+    rest = result.fit.parameters[0]
+    wide = wider_camera(camera, photo)
+    alpha = render(result.avatar, rest, wide, whole).alpha
+    # Rows from the crown down to where the bust begins to fade.
+    low = project(result.avatar.means[result.avatar.on_bust], wide)[0][:, 1].max() - 30
+    rows = torch.arange(len(alpha)) < low
+    shown, covered = photo.bust.matte[rows] > 0.5, alpha[rows] > 0.5
+    assert float((shown & covered).sum() / (shown | covered).sum()) > 0.93

@@ -14,8 +14,11 @@ BUILT_IN = pytest.mark.skipif("UIKA_HEAD" in os.environ, reason="skipped: anothe
 
 
 @BUILT_IN
-def test_splats_of_the_built_in_head_agree_with_mitsuba() -> None:
-    reports, gradients, pictures = validate(load_head(), 1, ((20.0, 5.0),))
+@pytest.mark.parametrize("bust", [False, True])
+def test_splats_of_the_built_in_head_agree_with_mitsuba(bust: bool) -> None:
+    head = load_head() if bust else load_head().without_bust
+    reports, gradients, pictures = validate(head, 1, ((20.0, 5.0),))
+    assert [report.bust for report in reports] == [bust]
     assert [report.failures() for report in reports] == [[]]
     assert gradients.passed(), gradients
     assert pictures[0][1].shape[1] == 3 * pictures[0][1].shape[0]
@@ -51,4 +54,4 @@ def test_normals_of_a_tilted_plane() -> None:
 @pytest.mark.slow
 def test_the_command_writes_a_report(tmp_path: Path) -> None:
     assert main(["-o", str(tmp_path / "report"), "--quick"]) == 0
-    assert len(list((tmp_path / "report").glob("*.png"))) == 6
+    assert len(list((tmp_path / "report").glob("*.png"))) == 12

@@ -25,8 +25,8 @@ def test_follower_learns_and_then_turns_as_the_face_does(acted: tuple[Path, torc
         assert follower.ready == (pose is not None)
         if pose is None:
             continue
-        assert all(bool(torch.isfinite(value).all()) for value in (pose.expression, pose.rotation, pose.translation))
-        turned = rodrigues(pose.rotation[None])[0]
+        assert all(bool(torch.isfinite(value).all()) for value in (pose.expression, pose.neck, pose.translation))
+        turned = rodrigues(pose.neck[None])[0]
         found.append(torch.atan2(turned[0, 2], turned[2, 2]))
         truth.append(yaw[index])
         opened.append(float(pose.expression[jaw]))

@@ -29,7 +29,7 @@ def test_track_command(acted: tuple[Path, torch.Tensor], head: HeadModel, tmp_pa
     assert preview.stat().st_size > 10_000
     motion = load_motion(output, head)
     assert (len(motion), motion.fps) == (len(yaw), FPS)
-    turned = rodrigues(motion.rotation)
+    turned = rodrigues(motion.neck)
     found = torch.atan2(turned[:, 0, 2], turned[:, 2, 2])
     assert float(torch.corrcoef(torch.stack((found, yaw)))[0, 1]) > 0.97
     assert float(torch.rad2deg((found - yaw).abs()).median()) < 6.0

@@ -56,7 +56,7 @@ class PaintedPerson:
         return self._views
 
     def sample(self, index: int) -> Sample:
-        head = load_head()
+        head = load_head().without_bust
         random = np.random.default_rng([self._seed, index])
         shape = torch.from_numpy(np.random.default_rng(self._seed).normal(size=len(head.identity_basis))).float()
         params = HeadParameters.zeros(head).replace(identity=shape)

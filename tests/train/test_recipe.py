@@ -103,7 +103,7 @@ def test_backgrounds_are_drawn_evenly() -> None:
 
 
 def test_gaussians_start_on_the_template() -> None:
-    head = load_head()
+    head = load_head().without_bust
     item = ItemMaker(PaintedPeople(), ON_TEMPLATE)[Draw(0, 1, 2, 5)]
     binding = uv_texels(head, 32, "released")
     torch.testing.assert_close(item.points, surface_points(head.template, head.faces, binding), rtol=0, atol=0)
@@ -112,7 +112,7 @@ def test_gaussians_start_on_the_template() -> None:
 
 
 def test_gaussians_are_moved_by_skinning_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    head = load_head()
+    head = load_head().without_bust
     item = ItemMaker(PaintedPeople(), ON_TEMPLATE)[Draw(0, 1, 1, 5)]
     moved = HeadParameters.zeros(head, 1).replace(
         jaw=torch.tensor([[0.2, 0.0, 0.0]]), neck=torch.tensor([[0.0, 0.3, 0]])

@@ -1,6 +1,8 @@
 """Heads sampled from `anny`: identities, the 52 ARKit actions, region probes, joints, topology."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +38,8 @@ class RawHeads:
     uv_faces: np.ndarray  # [F,3]
 
 
-def _y_up(points: np.ndarray) -> np.ndarray:
+def y_up(points: np.ndarray) -> np.ndarray:
+    """Points of `anny`, whose Z is up, with Y up."""
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], -1)
 
 
@@ -52,30 +55,41 @@ def sample_heads() -> RawHeads:
     model = anny.Anny(
         rig="makehuman-head", topology="head", facial_actions="all", phenotypes="all", local_changes="all"
     )
-    rest = torch.eye(4, dtype=torch.float64)[None, None]
-
-    def run(phenotypes: dict, local: dict | None = None, actions: dict | None = None, n: int = 1) -> dict:
-        return model(
-            pose_parameters=rest.repeat(n, model.bone_count, 1, 1),
-            phenotype_kwargs=phenotypes,
-            local_changes_kwargs=local or {},
-            facial_actions=actions or {},
-        )
-
     one = torch.ones(1, dtype=torch.float64)
     adult = {name: 0.5 * one for name in model.phenotype_labels} | {"age": 0.65 * one}
-    base = _y_up(run(adult)["rest_vertices"][0].numpy())
+    base = y_up(run(model, adult)["rest_vertices"][0].numpy())
 
     def moved(**kwargs: dict) -> np.ndarray:
-        return _y_up(run(adult, **kwargs)["rest_vertices"][0].numpy()) - base
+        return y_up(run(model, adult, **kwargs)["rest_vertices"][0].numpy()) - base
 
     actions = np.stack([moved(actions={name: one}) for name in model.facial_action_labels])
     probes = {
         region: sum(np.linalg.norm(moved(local={name: one}), axis=-1) for name in names)
         for region, names in REGION_PROBES.items()
     }
+    people = list(draw_people(model))
+    return RawHeads(
+        identities=np.concatenate([vertices for vertices, _ in people]),
+        identity_joints=np.concatenate([joints for _, joints in people]),
+        neutral=base,
+        actions=actions,
+        action_names=list(model.facial_action_labels),
+        probes=probes,
+        bones=list(model.bone_labels),
+        bone_weights=bone_weights(model),
+        faces=model.faces.numpy(),
+        uvs=model.texture_coordinates.numpy(),
+        uv_faces=model.face_texture_coordinate_indices.numpy(),
+    )
+
+
+def draw_people(model: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Vertices [BATCH,V,3] and bone heads [BATCH,J,3] of the SAMPLES people, batch by batch, always the same people.
+
+    Args:
+        model: `anny.Anny` with all phenotypes and local changes, of any topology.
+    """
     generator = torch.Generator().manual_seed(SEED)
-    vertices, joints = [], []
     for _ in range(0, SAMPLES, BATCH):
         people = {name: torch.rand(BATCH, generator=generator, dtype=torch.float64) for name in model.phenotype_labels}
         for name in CENTRED:
@@ -94,22 +108,25 @@ def sample_heads() -> RawHeads:
             local[name] = (sigma * draw).clip(-1, 1)
             if name.startswith("l-"):
                 local["r-" + name[2:]] = local[name]
-        out = run(people, local, n=BATCH)
-        vertices.append(_y_up(out["rest_vertices"].numpy()))
-        joints.append(_y_up(out["rest_bone_heads"].numpy()))
-    weights = np.zeros((len(base), model.bone_count))
-    rows = np.arange(len(base))[:, None]
-    np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
-    return RawHeads(
-        identities=np.concatenate(vertices),
-        identity_joints=np.concatenate(joints),
-        neutral=base,
-        actions=actions,
-        action_names=list(model.facial_action_labels),
-        probes=probes,
-        bones=list(model.bone_labels),
-        bone_weights=weights,
-        faces=model.faces.numpy(),
-        uvs=model.texture_coordinates.numpy(),
-        uv_faces=model.face_texture_coordinate_indices.numpy(),
+        out = run(model, people, local, n=BATCH)
+        yield y_up(out["rest_vertices"].numpy()), y_up(out["rest_bone_heads"].numpy())
+
+
+def run(model: Any, phenotypes: dict, local: dict | None = None, actions: dict | None = None, n: int = 1) -> dict:
+    """The model of n people in its rest pose."""
+    rest = torch.eye(4, dtype=torch.float64)[None, None]
+    moved = {} if actions is None else {"facial_actions": actions}
+    return model(
+        pose_parameters=rest.repeat(n, model.bone_count, 1, 1),
+        phenotype_kwargs=phenotypes,
+        local_changes_kwargs=local or {},
+        **moved,
     )
+
+
+def bone_weights(model: Any) -> np.ndarray:
+    """Skinning weights [V,J]."""
+    weights = np.zeros((len(model.vertex_bone_indices), model.bone_count))
+    rows = np.arange(len(weights))[:, None]
+    np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
+    return weights

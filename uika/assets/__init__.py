@@ -1,10 +1,11 @@
-"""Files that come with the package: the head, the network's weights, the demo portrait; licences in LICENSES.md."""
+"""Files that come with the package: head and bust, the network's weights, the demo portrait; see LICENSES.md."""
 
 from pathlib import Path
 
 _FOLDER = Path(__file__).resolve().parent
 PORTRAIT = _FOLDER / "portrait.jpg"
 HEAD = _FOLDER / "head.npz"
+BUST = _FOLDER / "bust.npz"
 TINY_WEIGHTS = _FOLDER / "tiny.safetensors"
 FACE_MODELS = _FOLDER / "face"
 LANDMARK_BIAS = _FOLDER / "detector_bias.npz"

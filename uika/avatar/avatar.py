@@ -43,7 +43,7 @@ class Avatar:
 
     head_id: str
     identity: Tensor  # [K] standard deviations
-    static_offset: Tensor  # [V,3] metres, added to the head's template (hair, mostly)
+    static_offset: Tensor  # [V,3] metres, added to the head's template (hair and clothes, mostly)
     means: Tensor  # [M,3] metres
     quats: Tensor  # [M,4] wxyz
     scales: Tensor  # [M,3] metres, standard deviations
@@ -54,6 +54,7 @@ class Avatar:
     provenance: Mapping[str, str] = field(default_factory=dict)
     skinning: Skinning = "surface"  # how it is moved, see `pose`
     light: Tensor | None = None  # [9,3] that the colours are kept under, see `uika.head.light`; None if unknown
+    bust_triangle: int | None = None  # the first triangle of the head's bust, from which on Gaussians lie on it
 
     def __post_init__(self) -> None:
         """Check shapes, types and values.
@@ -91,12 +92,21 @@ class Avatar:
             raise AvatarError("avatar has no Gaussians")
         if bool((self.scales < 0).any()) or bool((self.triangle < 0).any()):
             raise AvatarError("avatar tensors 'scales' and 'triangle' must not hold negative values")
+        if self.bust_triangle is not None and self.bust_triangle < 0:
+            raise AvatarError("avatar entry 'bust_triangle' must not be negative")
         if bool((self.opacities < 0).any()) or bool((self.opacities > 1).any()):
             raise AvatarError("avatar tensor 'opacities' must lie between 0 and 1")
 
     def __len__(self) -> int:
         """The number of Gaussians."""
         return len(self.means)
+
+    @property
+    def on_bust(self) -> Tensor:
+        """Which Gaussians [M] lie on the bust rather than on the head."""
+        if self.bust_triangle is None:
+            return torch.zeros(len(self), dtype=torch.bool)
+        return self.triangle >= self.bust_triangle
 
     def save(self, path: str | Path) -> None:
         """Write a safetensors file; it appears under its name only when it is complete."""
@@ -108,6 +118,8 @@ class Avatar:
             "provenance": json.dumps(dict(self.provenance), sort_keys=True),
             "skinning": self.skinning,
         }
+        if self.bust_triangle is not None:
+            metadata["bust_triangle"] = str(self.bust_triangle)
         write_tensors(path, tensors, metadata)
 
     @staticmethod
@@ -134,6 +146,9 @@ class Avatar:
         Raises:
             AvatarError: it is another one.
         """
+        alone = head.without_bust
+        if self.head_id == alone.id and len(self.static_offset) == len(alone.template):
+            head = alone  # made for this head before it had a bust, which stays without Gaussians
         if head.id != self.head_id:
             raise AvatarError(
                 f"the avatar was made for the head model '{self.head_id}', but '{head.id}' is loaded; "
@@ -189,7 +204,7 @@ class Avatar:
 
 
 _OPTIONAL = {"light"}  # files of earlier versions lack them
-_TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance", "skinning"))
+_TENSORS = tuple(f.name for f in fields(Avatar) if f.name not in ("head_id", "provenance", "skinning", "bust_triangle"))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -218,6 +233,7 @@ def _read(path: Path) -> dict[str, Any]:
                 "head_id": metadata["head_id"],
                 "provenance": {str(key): str(value) for key, value in provenance.items()},
                 "skinning": metadata.get("skinning", "surface"),
+                "bust_triangle": int(metadata["bust_triangle"]) if "bust_triangle" in metadata else None,
                 **tensors,
             }
     except SafetensorError as error:

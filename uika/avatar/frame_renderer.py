@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.avatar.rendering import motion_cameras
+from uika.avatar.framing import Framing, motion_cameras
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices
 from uika.head.binding import rigid_turn
 from uika.head.posing import rest_joints
@@ -113,6 +113,7 @@ def film(
     *,
     size: int = 512,
     closing: float | None = None,
+    frame: Framing = "bust",
     progress: bool = False,
 ) -> Iterator[NDArray[np.uint8]]:
     """Render a motion frame by frame as bytes; what `frames` renders, without alpha and gradients.
@@ -128,6 +129,7 @@ def film(
         background: sRGB in [0,1].
         size: side of the picture in pixels when `cameras` is None.
         closing: transmittance at which a pixel is closed; None is one grey level at most, 0 leaves nothing out.
+        frame: what is framed then, as in `neutral_camera`.
         progress: whether to show a progress bar on stderr.
 
     Yields:
@@ -139,20 +141,20 @@ def film(
     """
     model = load_head() if head is None else head
     renderer = FrameRenderer(avatar, model, background, closing)
-    path = motion_cameras(avatar, motion, size) if cameras is None else cameras
+    path = motion_cameras(avatar, motion, size, frame) if cameras is None else cameras
     params = motion.parameters(avatar.identity)
-    frame: Frame | None = None
+    last: Frame | None = None
     for index in counted(range(len(motion)), progress, len(motion), "frames"):
         place = index % _BLOCK
         if place == 0:
             meshes = renderer.meshes(params[index : index + _BLOCK])
         projected = renderer.project(meshes[place], path[index])
-        done = None if frame is None else frame.numpy()
-        frame = renderer.blend(projected, frame)
+        done = None if last is None else last.numpy()
+        last = renderer.blend(projected, last)
         if done is not None:
             yield done
-    if frame is not None:
-        yield frame.numpy()
+    if last is not None:
+        yield last.numpy()
 
 
 def _personal(head: HeadModel, identity: Tensor, canonical: Tensor) -> HeadModel:

@@ -52,7 +52,7 @@ def prior_colors(
         if name in head.masks:
             seen = seen * (1 - mask_at_texels(head, binding, name))
     hair = _hairiness(head, static_offset)
-    vertices = _continue(head, *_to_vertices(head, binding, observed, seen), hair)
+    vertices = _continue(head, *texels_to_vertices(head, binding, observed, seen), hair)
     result = at_texels(head, binding, vertices)
     points = at_texels(head, binding, head.template)
     hairy = at_texels(head, binding, hair[:, None])[:, 0] * (labels == 0)
@@ -72,7 +72,7 @@ def prior_colors(
     return binding.to_map(result, fill=torch.nan)
 
 
-def _to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+def texels_to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     """Mean colour [V,3] of the texels around each vertex, and how well it was seen [V] in [0,1]."""
     corners = head.faces[binding.triangle].flatten()
     reach = binding.barycentric.flatten()

@@ -64,7 +64,7 @@ class SurfaceTexels:
 def surface_texels(
     head: HeadModel, identity: Tensor, static_offset: Tensor, size: int
 ) -> tuple[SurfaceTexels, Binding]:
-    """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas.
+    """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas; a bust gets none.
 
     Each splat follows its texel's footprint on the surface, stretched and turned as the atlas is there, so that
     neighbours overlap wherever the atlas is uneven. Centres lie on a surface that curves between the vertices, so that
@@ -79,14 +79,12 @@ def surface_texels(
     Returns:
         The surface with batch dimension 1, with its mirror map and regions, and the binding of its M texels.
     """
+    head = head.without_bust
+    static_offset = static_offset[: len(head.template)]
     binding = uv_texels(head, size)
     neutral = HeadParameters.zeros(head).replace(identity=identity)
     vertices = shaped_vertices(head, neutral, static_offset)
-    points = _curved(vertices, head.faces, binding, surface_points(vertices, head.faces, binding))
-    frames, sides = _texel_frames(head, vertices, binding, points)
-    sides = torch.where(_at_seam(binding)[:, None], SEAM * sides, sides)
-    scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
-    quats = matrices_to_quaternions(frames)
+    points, quats, scales = closing_splats(head, vertices, binding)
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     deviation = (vertices - head.template)[head.faces[binding.triangle]] * binding.barycentric[..., None]
     shape = binding.to_map(deviation.sum(1))
@@ -112,6 +110,15 @@ def template_texels(head: HeadModel, size: int) -> tuple[SurfaceTexels, Binding]
 def canonical_binding(head: HeadModel, canonical: str, size: int) -> Binding:
     """The texels of a model with this `ModelConfig.canonical`."""
     return uv_texels(head, size, "released" if canonical == "template" else "watertight")
+
+
+def closing_splats(head: HeadModel, vertices: Tensor, binding: Binding) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres [M,3], rotations [M,4] and sizes [M,3] of flat splats at texels that close a mesh [V,3]."""
+    points = _curved(vertices, head.faces, binding, surface_points(vertices, head.faces, binding))
+    frames, sides = _texel_frames(head, vertices, binding, points)
+    sides = torch.where(_at_seam(binding)[:, None], SEAM * sides, sides)
+    scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
+    return points, matrices_to_quaternions(frames), scales
 
 
 def _at_seam(binding: Binding) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -53,6 +53,8 @@ class Animate:
     """A photo of a face to be lit like."""
     fps: float | None = None
     """Frames per second; else 25, or the motion's own."""
+    frame: Literal["bust", "head"] = "bust"
+    """What is framed: the portrait with its shoulders, or the head alone."""
     watermark: bool = True
     """Mark the frames invisibly as rendered; `uika verify` finds it."""
 
@@ -62,7 +64,8 @@ class Animate:
         self._check()
         from uika.avatar import Avatar
         from uika.avatar.frame_renderer import film
-        from uika.avatar.rendering import check_renderer, check_view
+        from uika.avatar.framing import check_view
+        from uika.avatar.rendering import check_renderer
         from uika.head import load_head
         from uika.io.video import check_even, write_video
         from uika.motion.presets import get_motion
@@ -88,7 +91,7 @@ class Animate:
             motion = self._tracked(self.video, head)
             if self.save_motion is not None:
                 write_motion(motion, self.save_motion, head)
-        pictures = film(avatar, motion, head=head, size=self.size, progress=True)
+        pictures = film(avatar, motion, head=head, size=self.size, frame=self.frame, progress=True)
         marked = map(mark, pictures) if self.watermark else pictures
         provenance = picture_provenance(avatar, watermark=self.watermark)
         count = write_video(target, marked, motion.fps, provenance, sound)

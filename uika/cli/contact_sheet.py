@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from uika.avatar.rendering import neutral_camera, render
+from uika.avatar.framing import Framing, neutral_camera
+from uika.avatar.rendering import render
 from uika.head import Camera, HeadModel, HeadParameters
 from uika.io.video import to_bytes
 from uika.motion.presets import EXPRESSIONS, expression_vector
@@ -38,7 +39,7 @@ def contact_sheet(cells: Sequence[tuple[str, Tensor]], columns: int, cell: int =
     return torch.from_numpy(np.asarray(sheet).astype(np.float32) / 255)
 
 
-def reconstruction_sheet(result: Reconstruction, head: HeadModel, cell: int = 256) -> Tensor:
+def reconstruction_sheet(result: Reconstruction, head: HeadModel, cell: int = 256, frame: Framing = "bust") -> Tensor:
     """The first photo, the avatar from the photo's camera, from four sides and with four expressions; [H,W,3]."""
     avatar = result.avatar
     assert result.fit is not None  # of the built-in network, which needs one
@@ -52,8 +53,8 @@ def reconstruction_sheet(result: Reconstruction, head: HeadModel, cell: int = 25
         ("photo", result.photos[0].image.permute(1, 2, 0)),
         ("avatar at the photo's camera", look(result.fit.parameters[0], result.fit.cameras[0])),
     ]
-    front = neutral_camera(avatar, size=2 * cell)
-    views = {f"{yaw:+.0f} degrees": neutral_camera(avatar, yaw, size=2 * cell) for yaw in _YAWS}
+    front = neutral_camera(avatar, size=2 * cell, frame=frame)
+    views = {f"{yaw:+.0f} degrees": neutral_camera(avatar, yaw, size=2 * cell, frame=frame) for yaw in _YAWS}
     cells += [(label, look(rest, camera)) for label, camera in views.items()]
     for name in _FACES:
         cells.append((name, look(rest.replace(expression=expression_vector(head, EXPRESSIONS[name])), front)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -22,6 +22,8 @@ class Demo:
 
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out/demo")
     """The folder for avatar.safetensors, talk.mp4 and sheet.png."""
+    frame: Literal["bust", "head"] = "bust"
+    """What is framed: the portrait with its shoulders, or the head alone."""
     watermark: bool = True
     """Mark video and sheet invisibly as rendered; `uika verify` finds it."""
 
@@ -46,11 +48,11 @@ class Demo:
         avatar.save(avatar_file)
         known = picture_provenance(avatar, watermark=self.watermark)
         with result.report.stage("sheet"):
-            sheet = reconstruction_sheet(result, head)
+            sheet = reconstruction_sheet(result, head, frame=self.frame)
             write_png(picture, mark(sheet) if self.watermark else sheet, known)
         with result.report.stage("video"):
             motion = get_motion("talk", head)
-            pictures = film(avatar, motion, head=head, progress=True)
+            pictures = film(avatar, motion, head=head, frame=self.frame, progress=True)
             write_video(video, map(mark, pictures) if self.watermark else pictures, motion.fps, known)
         print_seconds(result.report)
         for path in (avatar_file, picture, video):

@@ -45,6 +45,8 @@ class Export:
     """Write a .ply relative to the triangles, as GaussianAvatars does."""
     axes: Literal["y-down", "y-up"] = "y-down"
     """Of .ply and .splat; most of their viewers assume Y down."""
+    framing: Literal["bust", "head"] = "bust"
+    """What an .html shows at first: the portrait with its shoulders, or the head alone."""
     count: int | None = None
     """Keep at most so many Gaussians."""
 
@@ -93,6 +95,8 @@ class Export:
             raise UikaError(f"{self.output}: holds one pose; add --frame, or name a folder for all of the motion")
         if self.with_binding and (kind != ".ply" or self.motion is not None):
             raise UikaError("--with-binding needs a .ply to write and no --motion: such a file is canonical")
+        if self.framing != "bust" and kind != ".html":
+            raise UikaError("--framing only concerns .html pages")
         if self.axes == "y-up" and (kind not in _TURNED or self.with_binding):
             raise UikaError("--axes only concerns .ply and .splat files without --with-binding")
 
@@ -120,7 +124,7 @@ class Export:
             export.write_npz(self.output, avatar, head, motion)
             return "" if motion is None else f", {len(motion)} frames"
         if kind == ".html" and motion is not None:
-            size = export.write_html(self.output, avatar, motion, head)
+            size = export.write_html(self.output, avatar, motion, head, self.framing)
             return f", {len(motion)} frames, {size / 1e6:.1f} MB"
         if kind == "" and motion is not None:
             frames = export.write_ply_sequence(self.output, avatar, motion, head, y_down=down, progress=True)

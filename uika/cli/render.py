@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -33,6 +33,8 @@ class Render:
     """"studio" or a Radiance picture (.hdr) of the surroundings to be lit by; it stays fixed to the head."""
     light_from: Path | None = None
     """A photo of a face to be lit like."""
+    frame: Literal["bust", "head"] = "bust"
+    """What is framed: the portrait with its shoulders, or the head alone."""
     watermark: bool = True
     """Mark the picture invisibly as rendered; `uika verify` finds it."""
 
@@ -40,7 +42,8 @@ class Render:
         """Render and save."""
         target = check_output(self.output, ".png")
         from uika.avatar import Avatar
-        from uika.avatar.rendering import check_renderer, check_view, neutral_camera, render
+        from uika.avatar.framing import check_view, neutral_camera
+        from uika.avatar.rendering import check_renderer, render
         from uika.head import HeadParameters, load_head
         from uika.io.video import write_png
         from uika.safeguards import mark, picture_provenance
@@ -50,7 +53,7 @@ class Render:
         avatar.check_head(head)
         avatar = under_light(avatar, head, self.light, self.light_from)
         check_renderer()
-        camera = neutral_camera(avatar, self.yaw, self.pitch, self.size)
+        camera = neutral_camera(avatar, self.yaw, self.pitch, self.size, self.frame)
         rgb = render(avatar, HeadParameters.zeros(head), camera, head).rgb
         marked = mark(rgb) if self.watermark else rgb
         write_png(target, marked, picture_provenance(avatar, watermark=self.watermark))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -32,6 +33,8 @@ class View:
     """Show at most so many Gaussians."""
     port: int = 8080
     """The port on 127.0.0.1; a higher one if it is taken."""
+    frame: Literal["bust", "head"] = "bust"
+    """What is framed: the portrait with its shoulders, or the head alone."""
     watermark: bool = True
     """Mark the pictures that the page renders."""
 
@@ -66,7 +69,9 @@ class View:
         if self.live_link is not None:
             camera = LiveLinkFace(head, self.live_link, self.listen)
             print(f"listening for Live Link Face on {':'.join(map(str, camera.place))} (UDP)", flush=True)
-        with Viewer(avatar, head, motion, self.port, camera=camera, watermark=self.watermark) as viewer:
+        with Viewer(
+            avatar, head, motion, self.port, camera=camera, frame=self.frame, watermark=self.watermark
+        ) as viewer:
             print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
             while True:
                 time.sleep(1.0)

@@ -163,7 +163,8 @@ class Synthetic:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=path.parent))
         try:
-            for name, data in generate_identity(load_head(), self._seed, index, self._views, self._frames, self._size):
+            head = load_head().without_bust
+            for name, data in generate_identity(head, self._seed, index, self._views, self._frames, self._size):
                 target = partial / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(data)

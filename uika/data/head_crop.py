@@ -24,6 +24,7 @@ def head_square(sample: Sample, head: HeadModel) -> Square | None:
     Frames that a head fills were cropped before (synthetic people, portrait videos prepared at 512 pixels), and are
     taken whole; so are frames without head parameters, or with those of another head model.
     """
+    head = head.without_bust
     parameters = sample.parameters
     if parameters is None or len(parameters.identity) != len(head.identity_basis):
         return None

@@ -22,6 +22,7 @@ def check_parameters(view: View, head: HeadModel) -> HeadParameters:
         raise DataError(
             f"{view.key}: has no head parameters; track the capture first (VHAP writes flame_param_path into it)"
         )
+    head = head.without_bust
     sizes = (len(head.identity_basis), len(head.expression_basis), len(head.template))
     offset = len(head.template) if view.static_offset is None else len(view.static_offset)
     found = (len(view.parameters.identity), len(view.parameters.expression), offset)

@@ -86,7 +86,7 @@ def synthesize(settings: Synthesis, head: HeadModel | None = None, progress: boo
         raise UikaError("seed must not be negative and size at least 16 pixels")
     if not (settings.captures or settings.archives):
         raise UikaError("captures and archives are both off; nothing would be kept")
-    model = load_head() if head is None else head
+    model = (load_head() if head is None else head).without_bust
     root = check_folder(settings.output)
     wanted = range(part, settings.identities, parts)
     made = kept = 0

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from uika.assets import PORTRAIT
 from uika.avatar import Avatar
-from uika.avatar.rendering import neutral_camera, render
+from uika.avatar.framing import neutral_camera
+from uika.avatar.rendering import render
 from uika.canonical.surface import surface_texels
 from uika.fitting import pixel_uv
 from uika.fitting.fit import Fit
@@ -45,7 +46,7 @@ class Views:
 
 def make_views(count: int, size: int = 512, map_size: int = 384, source: Path = PORTRAIT) -> Views:
     """Render `count` views of the avatar of a photo; every other one from the other side, the frontal one first."""
-    head = load_head()
+    head = load_head().without_bust
     avatar = reconstruct([source], head, "none").avatar
     cameras = [_camera(avatar, index, size) for index in range(count)]
     params = HeadParameters.zeros(head).replace(identity=avatar.identity)

@@ -101,7 +101,7 @@ def evaluate_all(
     first = wanted[0]
     for settings in wanted:
         check_settings(settings)
-    head = load_head() if head is None else head
+    head = (load_head() if head is None else head).without_bust
     loaded = None if first.external else load_model(first.model, first.estimator, first.backbone)
     if loaded is not None:
         check_loaded(loaded, head, first.estimator)

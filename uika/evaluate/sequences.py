@@ -94,8 +94,9 @@ def check_sample(sample: Sample, head: HeadModel) -> Sample:
     """
     if sample.parameters is None:
         raise DataError(f"{sample.key}: has no head parameters, which targets are driven by")
-    sizes = len(head.identity_basis), len(head.expression_basis), len(head.template)
-    offset = len(head.template) if sample.static_offset is None else len(sample.static_offset)
+    vertices = len(head.without_bust.template)
+    sizes = len(head.identity_basis), len(head.expression_basis), vertices
+    offset = vertices if sample.static_offset is None else len(sample.static_offset)
     found = len(sample.parameters.identity), len(sample.parameters.expression), offset
     if found != sizes:
         raise DataError(f"{sample.key}: made for another head model (identities, expressions, vertices: {found})")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.avatar.rendering import neutral_camera
+from uika.avatar.framing import FOV, Framing, target_and_distance
 from uika.errors import UikaError
 from uika.export.driven import driven_arrays, driven_names
 from uika.export.vertex_motion import vertex_motion
@@ -33,7 +33,7 @@ _SCRIPTS = ("drive.js", "shaders.js", "viewer.js")
 _SCENE_TAG = '<script id="scene" type="application/json">'
 
 
-def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel) -> int:
+def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel, frame: Framing = "bust") -> int:
     """Write a page that plays a motion, orbits with the mouse and opens from disk without a network.
 
     Scripts drive its face by `avatar.set`, `avatar.pose` and messages; see docs/page.md.
@@ -43,6 +43,7 @@ def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel
         avatar: the avatar; it takes about 20 bytes for each Gaussian.
         motion: the movement; a camera path in it is left out.
         head: the head model that the avatar was made for.
+        frame: what the page shows at first, as in `uika.neutral_camera`.
 
     Returns:
         The file's size in bytes.
@@ -55,17 +56,16 @@ def write_html(path: str | Path, avatar: Avatar, motion: Motion, head: HeadModel
     arrays = {**_still(avatar, head), **_moving(avatar, motion, head), **driven_arrays(avatar, head)}
     still = HeadParameters.zeros(head).replace(identity=avatar.identity)
     manifest, binary = _packed(arrays)
-    camera = neutral_camera(avatar)
-    distance = float((camera.position - _centre(avatar)).norm())
+    middle, distance = target_and_distance(avatar, frame)
     scene = {
         "arrays": manifest,
         "count": len(avatar),
         "vertices": len(head.template),
         "frames": len(motion),
         "fps": motion.fps,
-        "target": _centre(avatar).tolist(),
+        "target": middle.tolist(),
         "distance": distance,
-        "fov": 20.0,
+        "fov": FOV,
         "actions": driven_names(head),
         "neck": rest_joints(head, still)[1].tolist(),
         "provenance": dict(avatar.provenance),
@@ -102,12 +102,6 @@ def html_provenance(path: str | Path) -> dict[str, str]:
         return {str(key): str(value) for key, value in scene["provenance"].items()}
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
         return {}
-
-
-def _centre(avatar: Avatar) -> Tensor:
-    """What `neutral_camera` looks at."""
-    low, high = torch.quantile(avatar.means, torch.tensor([0.002, 0.998]), dim=0)
-    return (low + high) / 2
 
 
 def _still(avatar: Avatar, head: HeadModel) -> dict[str, NDArray[Any]]:

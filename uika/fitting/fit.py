@@ -34,7 +34,8 @@ class Fit:
     """N fitted photos.
 
     parameters: [N] head parameters with one identity; the cameras carry the head's pose.
-    cameras: [N] cameras at the crops' size. static_offset [V,3] metres, the hair's displacement of the neutral head.
+    cameras: [N] cameras at the crops' size. static_offset [V,3] metres, the hair's displacement of the
+    neutral head, which has no bust yet.
     error [N]: mean landmark distance in outer eye-corner distances. gain: of the refinement by colours, if it ran.
     landmarks [N,478,2]: as detected, crop pixels, where they are known.
     """
@@ -73,6 +74,7 @@ def fit_photos(
     Raises:
         ValueError: there is no photo, or the photos have different sizes.
     """
+    head = head.without_bust
     if not photos:
         raise ValueError("photos: give at least one photo")
     sizes = {tuple(photo.matte.shape) for photo in photos}

@@ -27,6 +27,7 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         uv [N,S,S,2] in [0,1] with v measured from the top (0 where nothing is hit), valid [N,S,S] bool,
         weight [N,S,S] in [0,1]: trust from the matte and the viewing angle, 0 where not valid.
     """
+    head = head.without_bust
     size = fit.cameras.width
     if mattes.shape[1:] != (size, fit.cameras.height) or len(mattes) != len(fit.error):
         raise ValueError(f"mattes: need [{len(fit.error)},{fit.cameras.height},{size}], got {tuple(mattes.shape)}")

@@ -3,7 +3,8 @@
 from uika.head.atlas import Binding, uv_texels
 from uika.head.binding import pose_gaussians, skin_points, surface_frames, surface_points
 from uika.head.camera import Camera, ellipse, look_at, orbit, project
-from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel, load_head, save_arrays, save_head
+from uika.head.files import load_head, save_arrays, save_head
+from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel
 from uika.head.parameters import HeadParameters
 from uika.head.posing import joint_transforms, pose_vertices, rest_joints, shaped_vertices, vertex_normals
 from uika.head.raster import rasterize

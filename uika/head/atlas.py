@@ -60,8 +60,10 @@ class Binding:
 
 
 @lru_cache(maxsize=16)
-def uv_texels(head: HeadModel, size: int, rule: Literal["watertight", "released"] = "watertight") -> Binding:
-    """Find the texels of a `size` x `size` map that the head's atlas covers; cached for each head.
+def uv_texels(
+    head: HeadModel, size: int, rule: Literal["watertight", "released"] = "watertight", tile: int = 0
+) -> Binding:
+    """Find the texels of a `size` x `size` map that one tile of the head's atlas covers; cached for each head.
 
     Args:
         head: the head model.
@@ -69,13 +71,14 @@ def uv_texels(head: HeadModel, size: int, rule: Literal["watertight", "released"
         rule: "watertight" takes every texel centre in the atlas, edges included; "released" takes those strictly
             inside a triangle that runs counter-clockwise with v up, as the authors' released model does, so that
             attribute maps have the same number of Gaussians.
+        tile: 0 for the head, 1 for its bust; u is counted from the tile's left side.
 
     Raises:
         ValueError: the size is not positive or the rule is unknown.
     """
     if size < 1 or rule not in ("watertight", "released"):
         raise ValueError(f"uv_texels needs size >= 1 and rule 'watertight' or 'released', got {size} and {rule!r}")
-    points = torch.stack((head.uvs[:, 0], 1 - head.uvs[:, 1]), -1).double() * size
+    points = torch.stack((head.uvs[:, 0] - tile, 1 - head.uvs[:, 1]), -1).double() * size
     if rule == "released":
         triangle, barycentric = rasterize(points, head.uv_faces, size, size, cull="back", rule="strict")
     else:

@@ -14,10 +14,16 @@ from uika.head.rotations import rodrigues
 def shaped_vertices(head: HeadModel, params: HeadParameters, static_offset: Tensor | None = None) -> Tensor:
     """Vertices [...,V,3] in metres with identity, `static_offset` [V,3] and expression, before any pose.
 
+    An offset of the head alone leaves the bust where it is.
+
     Raises:
         ValueError: the number of identity or expression coefficients is not the head's.
     """
-    neutral = head.template if static_offset is None else head.template + static_offset
+    neutral = head.template
+    if static_offset is not None:
+        if head.bust is not None and len(static_offset) == head.bust.vertex:
+            static_offset = torch.nn.functional.pad(static_offset, (0, 0, 0, len(head.template) - head.bust.vertex))
+        neutral = neutral + static_offset
     identity = _blend(params.identity, head.identity_basis, "identity")
     return neutral + identity + _blend(params.expression, head.expression_basis, "expression")
 

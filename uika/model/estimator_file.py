@@ -44,6 +44,7 @@ def check_estimator_head(path: str | Path, head: HeadModel) -> None:
     Raises:
         CheckpointError: the sentence says which head model it was trained for.
     """
+    head = head.without_bust
     if check_kind(path, ESTIMATORS) != "estimator":
         if len(head.template) != _FLAME_VERTICES:
             raise CheckpointError(

@@ -28,7 +28,7 @@ _PLACE = {name: index for index, name in enumerate(ARKIT_ACTIONS)}
 def read_csv(path: str | Path) -> Motion:
     """A Live Link Face recording, or another table of named activations, as a motion in the order of `ARKIT_ACTIONS`.
 
-    Head angles become the root's rotation: yaw about Y, then pitch about X, then roll about Z, radians. The frame rate
+    Head angles become the neck's rotation: yaw about Y, then pitch about X, then roll about Z, radians. The frame rate
     follows from the timecodes, or from a column of times; 60 where they span less than two seconds. Cells may be parted
     by commas, semicolons (then with decimal commas) or tabs. Rows without a face, which Live Link Face writes with a
     `BlendShapeCount` of 0, are filled in from their neighbours; see `uika.motion.recording.to_motion`.
@@ -93,7 +93,7 @@ def write_csv(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
     Raises:
         MotionError: the names are not actions or not one for each column.
     """
-    values, angles = _ordered(motion, names), to_angles(motion.rotation)
+    values, angles = _ordered(motion, names), to_angles(motion)
     header = ["timecode", "blendShapeCount", *ARKIT_ACTIONS, *HEAD_ANGLES]
     with replacing(check_output(path, ".csv")) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)

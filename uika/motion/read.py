@@ -67,9 +67,10 @@ def _from_flame(motion: Motion, head: HeadModel, source: HeadModel | None, place
             f"{place}: holds FLAME expressions, but the head model '{head.id}' has ARKit actions; also give the FLAME "
             "head that they belong to (`uika head import` makes it from FLAME's own file)"
         )
-    from uika.motion.retargeting import transfer
+    from uika.motion.retargeting import transfer, turned_by_the_neck
 
-    return transfer(replace(motion, expression=_padded(motion.expression, source, place)), source, head)
+    moved = transfer(replace(motion, expression=_padded(motion.expression, source, place)), source, head)
+    return moved if head.bust is None else turned_by_the_neck(moved, head)
 
 
 def _padded(expression: Tensor, head: HeadModel, place: Path) -> Tensor:

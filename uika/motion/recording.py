@@ -95,7 +95,7 @@ def to_motion(recording: Recording) -> Motion:
     table = torch.from_numpy(values).float()
     count = len(ARKIT_ACTIONS)
     rest = {name: torch.zeros(len(table), size) for name, size in _SIZES.items()}
-    return Motion(expression=table[:, :count], fps=fps, **{**rest, "rotation": from_angles(table[:, count:])})
+    return Motion(expression=table[:, :count], fps=fps, **{**rest, "neck": from_angles(table[:, count:])})
 
 
 def _number(row: dict[str, Any] | None, name: str) -> float:
@@ -178,11 +178,11 @@ def from_angles(angles: Tensor) -> Tensor:
     return axis_angles(rodrigues(yaw) @ rodrigues(pitch) @ rodrigues(roll))
 
 
-def to_angles(rotation: Tensor) -> Tensor:
-    """Yaw, pitch and roll [T,3] of axis-angle vectors [T,3]; the inverse of `from_angles`."""
+def to_angles(motion: Motion) -> Tensor:
+    """Yaw, pitch and roll [T,3] of the head, whether root or neck turn it; the inverse of `from_angles`."""
     from uika.head import rodrigues
 
-    m = rodrigues(rotation)
+    m = rodrigues(motion.rotation) @ rodrigues(motion.neck)
     yaw, roll = torch.atan2(m[:, 0, 2], m[:, 2, 2]), torch.atan2(m[:, 1, 0], m[:, 1, 1])
     return torch.stack((yaw, torch.asin((-m[:, 1, 2]).clamp(-1, 1)), roll), -1)
 

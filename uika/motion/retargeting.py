@@ -12,6 +12,7 @@ from uika.head import HeadModel, HeadParameters, pose_vertices
 from uika.head.actions import fitted_joints
 from uika.head.axis_angle import Array, axis_angle, rotation
 from uika.head.landmark_model import FrameModel, Pose, bounded_step, frame_model, head_landmarks, landmark_jacobian
+from uika.head.rotations import rodrigues
 from uika.motion.motion import Motion, MotionError
 
 LANDMARK_NOISE_METRES = 5e-4  # between meshes; against the prior of 1 on each squared coefficient
@@ -62,6 +63,20 @@ def transfer(motion: Motion, source: HeadModel, target: HeadModel) -> Motion:
             changed["eyes"][:, 3 * (joint - 3) : 3 * (joint - 2)] = turned[:, k]
     expression = torch.tensor(np.array(expressions), dtype=torch.float32)
     return replace(motion, expression=expression, jaw=changed["jaw"], eyes=changed["eyes"])
+
+
+def turned_by_the_neck(motion: Motion, head: HeadModel) -> Motion:
+    """The same movement of the head with a root that does not turn, so that a bust stands still below it."""
+    first = rodrigues(motion.rotation)
+    both = (first @ rodrigues(motion.neck)).double().numpy()
+    arm = head.joints[1] - head.joints[0]
+    neck = torch.tensor(np.stack([axis_angle(turn) for turn in both]), dtype=torch.float32)
+    return replace(
+        motion,
+        rotation=torch.zeros_like(neck),
+        neck=neck,
+        translation=motion.translation + (first @ arm - arm),
+    )
 
 
 def _rows(head: HeadModel, shared: list[int]) -> Tensor:

@@ -26,6 +26,21 @@ HAIR_LIMIT = 1.0  # hair is looked for up to this many face heights beyond the f
 EDGE_STEP = 0.02  # of the crop: the segmentation is unreliable this close to the photo's edge
 SCAN_SIDE = 256  # pixels, the resolution of the segmentation model
 MIN_SIZE, MAX_SIZE = 64, 2048
+BUST_TO_CROP = 1.75  # side of the crop that shows the shoulders too, over the head's; both have one top
+
+
+@dataclass(frozen=True)
+class BustCrop:
+    """A wider crop of a photo, of B x B pixels, for the shoulders.
+
+    image [3,B,B] and matte [B,B] as those of `Photo`; inside [B,B] is the share of each pixel that lies in the photo;
+    crop (x0, y0, side) in pixels of the upright photo.
+    """
+
+    image: Tensor
+    matte: Tensor
+    inside: Tensor
+    crop: Square
 
 
 @dataclass(frozen=True)
@@ -37,7 +52,8 @@ class Photo:
     landmarks [478,2] float32 in crop pixels (pixel centres at +0.5, may lie outside), mediapipe face mesh order;
     crop (x0, y0, side) of the square in the upright photo, in its pixels;
     original [3,S,S] float32, the crop with its own background;
-    focal length in crop pixels if the file tells it.
+    focal length in crop pixels if the file tells it;
+    bust, a wider crop if it was asked for.
     """
 
     path: str
@@ -48,15 +64,22 @@ class Photo:
     crop: Square
     original: Tensor
     focal: float | None = None
+    bust: BustCrop | None = None
 
 
-def prepare(path: str | Path, size: int = 512, background: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Photo:
+def prepare(
+    path: str | Path,
+    size: int = 512,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
+    bust: bool = False,
+) -> Photo:
     """Read a photo, find its largest face, crop the head, matte it and put it on `background` (sRGB in [0,1]).
 
     The crop is a square of 1.5 times the head's box, the head being the face extended over the hair; it may reach
     outside the photo, where the matte is 0. A file with transparency around the person brings its own matte.
-    The same file gives the same result. Raises `PhotoError` when the file cannot be read, shows no face, or one on its
-    head.
+    With `bust`, a wider crop is cut out too. The same file gives the same result.
+    Raises `PhotoError` when the file cannot be read, shows no face, or one on its head.
     """
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise ValueError(f"size: must lie between {MIN_SIZE} and {MAX_SIZE} pixels, got {size}")
@@ -73,14 +96,7 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
         raise PhotoError(path, problem)
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
-    crop = resample(rgb, square, size)
-    inside = coverage(rgb.shape[:2], square, size)
-    alpha = _matte(crop, landmarks, inside)
-    colours = estimate_foreground((crop / 255).astype(np.float32), alpha)
-    if picture.alpha is not None:
-        given = (resample(picture.alpha, square, size) / 255).astype(np.float32)
-        alpha, colours = _merge(alpha, given, colours, resample(picture.rgb, square, size))
-    alpha = alpha * inside
+    crop, alpha, colours, inside = _cut_out(picture, rgb, square, landmarks, size)
     plain = np.array(background, dtype=np.float32)
     return Photo(
         path=picture.path,
@@ -91,7 +107,37 @@ def prepare(path: str | Path, size: int = 512, background: tuple[float, float, f
         crop=square,
         original=_chw(plain + inside[..., None] * (crop.astype(np.float32) / 255 - plain)),
         focal=None if picture.focal is None else picture.focal * size / square[2],
+        bust=_bust_crop(picture, rgb, square, face, size, plain) if bust else None,
     )
+
+
+def _bust_crop(
+    picture: Picture,
+    rgb: NDArray[np.uint8],
+    head: Square,
+    face: NDArray[np.float64],
+    size: int,
+    plain: NDArray[np.float32],
+) -> BustCrop:
+    x0, y0, side = head
+    square = (x0 - (BUST_TO_CROP - 1) / 2 * side, y0, BUST_TO_CROP * side)
+    _, alpha, colours, inside = _cut_out(picture, rgb, square, to_crop(face, square, size), size)
+    image = _chw(plain + alpha[..., None] * (colours - plain))
+    return BustCrop(image, torch.from_numpy(alpha), torch.from_numpy(inside), square)
+
+
+def _cut_out(
+    picture: Picture, rgb: NDArray[np.uint8], square: Square, landmarks: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """A crop [S,S,3], its matte [S,S], the person's colours [S,S,3], and how far each pixel lies in the photo [S,S]."""
+    crop = resample(rgb, square, size)
+    inside = coverage(rgb.shape[:2], square, size)
+    alpha = _matte(crop, landmarks, inside)
+    colours = estimate_foreground((crop / 255).astype(np.float32), alpha)
+    if picture.alpha is not None:
+        given = (resample(picture.alpha, square, size) / 255).astype(np.float32)
+        alpha, colours = _merge(alpha, given, colours, resample(picture.rgb, square, size))
+    return crop, alpha * inside, colours, inside
 
 
 def _opaque(picture: Picture, background: tuple[float, float, float]) -> NDArray[np.uint8]:

@@ -49,6 +49,7 @@ class CanonicalHead:
         """
         from uika.model import Session
 
+        head = head.without_bust
         self.identity = torch.zeros(len(head.identity_basis))
         self.static_offset = torch.zeros_like(head.template)
         config, prior = loaded.network.config, None

@@ -45,28 +45,31 @@ def fit_files(
     refine: bool = True,
     report: Report | None = None,
     loaded: LoadedModel | None = None,
+    bust: bool = False,
 ) -> FittedPhotos:
     """Read photos of one person and fit the head to them; they come out in the order of their content hashes.
+
+    With `bust`, the photos keep a wider crop of the shoulders too.
 
     Raises:
         PhotoError: a photo cannot be read or shows no face; the message names it.
     """
     report = Report() if report is None else report
     with report.stage("photos"):
-        prepared = prepare_files(photos)
+        prepared = prepare_files(photos, bust=bust)
     return fit_prepared(prepared, head, refine=refine, report=report, loaded=loaded)
 
 
-def prepare_files(paths: Sequence[str | Path]) -> list[PreparedPhoto]:
+def prepare_files(paths: Sequence[str | Path], *, bust: bool = False) -> list[PreparedPhoto]:
     """`prepare_file` of each, several at once on a machine with several cores; in the order of the paths.
 
     Raises:
         PhotoError: one cannot be read or shows no face; the first such in order is named.
     """
     if len(paths) == 1:
-        return [prepare_file(paths[0])]
+        return [prepare_file(paths[0], bust=bust)]
     with ThreadPoolExecutor(min(len(paths), os.cpu_count() or 1)) as pool:
-        waiting = [pool.submit(prepare_file, path) for path in paths]
+        waiting = [pool.submit(prepare_file, path, bust=bust) for path in paths]
         try:
             return [each.result() for each in waiting]
         except BaseException:
@@ -75,15 +78,15 @@ def prepare_files(paths: Sequence[str | Path]) -> list[PreparedPhoto]:
             raise
 
 
-def prepare_file(path: str | Path) -> PreparedPhoto:
-    """All that a photo needs before it is fitted together with others.
+def prepare_file(path: str | Path, *, bust: bool = False) -> PreparedPhoto:
+    """All that a photo needs before it is fitted together with others; with `bust`, its shoulders too.
 
     Raises:
         PhotoError: it cannot be read or shows no face; the message names it.
     """
     from uika.photo import head_matte, prepare
 
-    photo = prepare(path)
+    photo = prepare(path, bust=bust)
     return PreparedPhoto(photo, head_matte(photo))
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
+from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
-from uika.reconstruction.fitted_photos import PreparedPhoto, fit_prepared, prepare_files
+from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_prepared, prepare_files
 from uika.reconstruction.models import check_loaded, load_model
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble
 from uika.reconstruction.report import Report
@@ -47,6 +48,7 @@ class GrowingAvatar:
         self._keep: Keep = keep
         self._photos: list[PreparedPhoto] = []
         self._first: tuple[Fit | None, CanonicalHead] | None = None
+        self._groups: list[FittedPhotos] = []  # photos that came in one step
 
     def __len__(self) -> int:
         """The number of photos."""
@@ -67,8 +69,8 @@ class GrowingAvatar:
             raise UikaError(f"give 1 to {MAX_PHOTOS - len(self)} more photos of one person, not {len(photos)}")
         report = Report() if report is None else report
         with report.stage("photos"):
-            new = prepare_files(photos)
-        return self._grown(self._photos, new, self._first, report)
+            new = prepare_files(photos, bust=self._loaded.takes_bust(self._head))
+        return self._grown(self._groups, new, self._first, report)
 
     def refresh(self, report: Report | None = None) -> Avatar:
         """The avatar as if all photos had come at once.
@@ -82,18 +84,25 @@ class GrowingAvatar:
 
     def _grown(
         self,
-        before: Sequence[PreparedPhoto],
+        before: Sequence[FittedPhotos],
         new: Sequence[PreparedPhoto],
         first: tuple[Fit | None, CanonicalHead] | None,
         report: Report,
     ) -> Avatar:
+        alone = self._head.without_bust
         known = None if first is None else first[0]
-        found = fit_prepared(new, self._head, report=report, known=known, loaded=self._loaded)
+        found = fit_prepared(new, alone, report=report, known=known, loaded=self._loaded)
         fit, canonical = first or (
             found.fit,
-            CanonicalHead(self._loaded, self._head, found.fit, self._keep, growing=True),
+            CanonicalHead(self._loaded, alone, found.fit, self._keep, growing=True),
         )
         gaussians = canonical.add(found.fit, found.images, found.mattes, report)
-        self._first, self._photos = (fit, canonical), [*before, *new]
-        digests = sorted(each.photo.sha256 for each in self._photos)
-        return assemble(self._loaded, self._head, canonical, gaussians, digests)
+        groups = [*before, found]
+        photos = [photo for group in groups for photo in group.photos]
+        digests = sorted(photo.sha256 for photo in photos)
+        avatar = assemble(self._loaded, alone, canonical, gaussians, digests)
+        if self._loaded.takes_bust(self._head):
+            avatar = with_bust(avatar, self._head, [group.fit for group in groups if group.fit], photos, report)
+        self._photos = [*self._photos, *new] if before else list(new)
+        self._first, self._groups = (fit, canonical), groups
+        return avatar

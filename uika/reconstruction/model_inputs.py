@@ -52,6 +52,7 @@ def model_inputs(
         uv: [N,2,H,W] correspondences with v down, NaN where a pixel shows no part of the head.
         weight: [N,H,W] trust in them, in [0,1].
     """
+    head = head.without_bust
     views, masks, uvs, weights = images[None], mattes[None, :, None], uv[None], weight[None, :, None]
     if config.canonical == "template":
         # Every pixel counts, nothing is supposed: what no photo shows is the network's to say.

@@ -37,6 +37,10 @@ class LoadedModel(NamedTuple):
         """Whether heads must be fitted to the photos."""
         return self.estimator is None or not self.on_template
 
+    def takes_bust(self, head: HeadModel) -> bool:
+        """Whether avatars get the head's bust: it hangs on a fitted head."""
+        return head.bust is not None and not self.on_template
+
     def template(self, head: HeadModel) -> tuple[Binding, Tensor]:
         """Where the Gaussians of a model on the template sit, and the points [M,3] that they start from.
 
@@ -115,6 +119,7 @@ def check_loaded(loaded: LoadedModel, head: HeadModel, estimator: str | Path | N
     """
     from uika.model.estimator_file import check_estimator_head
 
+    head = head.without_bust
     if estimator is not None:
         check_estimator_head(estimator, head)
     if loaded.on_template:

@@ -14,6 +14,7 @@ from uika._version import __version__
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
+from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
 from uika.reconstruction.models import LoadedModel, check_loaded, load_model
@@ -76,10 +77,13 @@ def reconstruct(
         loaded = load_model(model, estimator, backbone)
         head = load_head() if head is None else head
         check_loaded(loaded, head, estimator)
-    observed = fit_files(photos, head, refine=refine, report=report, loaded=loaded)
+    alone, bust = head.without_bust, loaded.takes_bust(head)
+    observed = fit_files(photos, alone, refine=refine, report=report, loaded=loaded, bust=bust)
     avatar = avatar_from_fit(
-        loaded, head, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
+        loaded, alone, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
     )
+    if bust and observed.fit is not None:
+        avatar = with_bust(avatar, head, [observed.fit], observed.photos, report)
     return Reconstruction(avatar, observed.photos, observed.fit, report)
 
 
@@ -98,7 +102,7 @@ def avatar_from_fit(
 
     Args:
         loaded: the model.
-        head: the head model.
+        head: the head model; a bust is left out.
         fit: heads and cameras of N photos, if the model needs them.
         images: [N,3,S,S] sRGB in [0,1] on one plain colour.
         mattes: [N,S,S] in [0,1].
@@ -106,6 +110,7 @@ def avatar_from_fit(
         report: gets times and counts.
         keep: as in `reconstruct`.
     """
+    head = head.without_bust
     canonical = CanonicalHead(loaded, head, fit, keep)
     gaussians = canonical.add(fit, images, mattes, report)
     return assemble(loaded, head, canonical, gaussians, digests)

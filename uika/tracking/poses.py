@@ -51,11 +51,14 @@ def _between(one: Pose, other: Pose, share: float) -> Pose:
 
 
 def poses_to_motion(poses: Sequence[Pose], model: FrameModel, head: HeadModel, identity: Tensor, fps: float) -> Motion:
-    """The poses as a motion in head space, as if a camera stood straight before the head's middle place."""
+    """The poses as a motion in head space, as if a camera stood straight before the head's middle place.
+
+    The neck turns the head, so that the torso stands still.
+    """
     flip = np.diag([1.0, -1.0, -1.0])  # camera axes to head axes
-    root = (head.joints[0].double() + torch.einsum("k,kc->c", identity, head.joint_identity[:, 0].double())).numpy()
+    neck = (head.joints[1].double() + torch.einsum("k,kc->c", identity, head.joint_identity[:, 1].double())).numpy()
     turns = np.stack([flip @ pose.rotation for pose in poses])
-    places = np.stack([flip @ pose.translation for pose in poses]) + turns @ root - root
+    places = np.stack([flip @ pose.translation for pose in poses]) + turns @ neck - neck
     rotations = _unwrapped(np.stack([axis_angle(turn) for turn in turns]))
     T = len(poses)
     jaw, eyes = np.zeros((T, 3)), np.zeros((T, 6))
@@ -71,8 +74,8 @@ def poses_to_motion(poses: Sequence[Pose], model: FrameModel, head: HeadModel, i
 
     return Motion(
         expression=real(np.stack([pose.expression for pose in poses])),
-        rotation=real(rotations),
-        neck=torch.zeros(T, 3),
+        rotation=torch.zeros(T, 3),
+        neck=real(rotations),
         jaw=real(jaw),
         eyes=real(eyes),
         translation=real(places - np.median(places, 0)),

@@ -90,7 +90,7 @@ class ItemMaker(torch.utils.data.Dataset[Item]):
     def _make(self, person: Person, draw: Draw, replaced: list[str]) -> Item:
         notes = (*replaced, *left_out(person))
         random = np.random.default_rng(draw.seed)
-        config, head = self._config, load_head()
+        config, head = self._config, load_head().without_bust
         extra = config.atlas_views if config.losses.atlas else 0
         wanted = config.targets + extra if config.part == "reconstructor" else 0
         photos, pictures = _choose(person, draw.sources, wanted, config, head, random)

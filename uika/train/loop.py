@@ -73,7 +73,7 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
         TrainingError: too many steps in a row were not finite.
         UikaError: the run's folder holds another training, or nothing to resume.
     """
-    head = load_head() if head is None else head
+    head = (load_head() if head is None else head).without_bust
     if setup.estimator is not None:
         config = replace(config, estimator=file_digest(setup.estimator))
     checkpoints = Checkpoints(setup.output / "checkpoints", config.keep, group)

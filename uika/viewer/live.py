@@ -43,6 +43,7 @@ class LiveSplats:
         if colors == "UV":
             corners = self._head.uvs[self._head.uv_faces[self.avatar.triangle]]
             uv = (corners * self.avatar.barycentric[..., None]).sum(1)
+            uv[:, 0] -= self.avatar.on_bust.to(uv.dtype)  # the bust's tile begins at 1
             shown = torch.cat((uv, torch.zeros(len(uv), 1)), -1)
         self._shown = shown
         rgba = torch.cat((shown, self.avatar.opacities[:, None]), -1).clamp(0, 1)

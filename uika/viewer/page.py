@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from uika.avatar import Avatar
-from uika.avatar.rendering import neutral_camera
+from uika.avatar.framing import Framing, neutral_camera, target_and_distance
 from uika.errors import UikaError
 from uika.head import HeadModel, HeadParameters
 from uika.io.video import to_bytes
@@ -43,6 +43,7 @@ class Viewer:
         port: int = 8080,
         *,
         camera: LiveFace | None = None,
+        frame: Framing = "bust",
         watermark: bool = True,
     ) -> None:
         """Start the server on 127.0.0.1.
@@ -53,6 +54,7 @@ class Viewer:
             motion: a movement to play; None takes the built-in `talk`.
             port: the first port to try.
             camera: whose face the avatar follows; it is stopped with the page.
+            frame: what the page's own views show, as in `uika.neutral_camera`.
             watermark: whether pictures that the page renders are marked.
 
         Raises:
@@ -65,7 +67,7 @@ class Viewer:
             raise UikaError('the viewer needs viser; run: pip install "uika-drjit[view]"') from error
         from uika.motion.presets import get_motion
 
-        self._head, self._camera, self._watermark = head, camera, watermark
+        self._head, self._camera, self._frame, self._watermark = head, camera, frame, watermark
         self._motion = get_motion("talk", head) if motion is None else motion
         self.live = LiveSplats(avatar, head)
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label="avatar", verbose=False)
@@ -112,7 +114,7 @@ class Viewer:
             "/avatar", centers=centers, covariances=small, rgbs=white, opacities=white[:, :1]
         )
         self._splats.buffer = buffer
-        self._target = torch.quantile(avatar.means, torch.tensor([0.002, 0.998]), dim=0).mean(0)
+        self._target = target_and_distance(avatar, self._frame)[0]
         self.server.on_client_connect(lambda client: self._look(client, 0.0, 0.0))
         self._status = gui.add_markdown(f"{count:,} Gaussians")
         presets = gui.add_button_group("Camera", tuple(_PRESETS))
@@ -151,7 +153,7 @@ class Viewer:
             self._mesh = add("/mesh", vertices, faces, wireframe=True, color=(40, 40, 40))
 
     def _look(self, client: Any, yaw: float, pitch: float) -> None:
-        camera = neutral_camera(self.live.avatar, yaw, pitch)
+        camera = neutral_camera(self.live.avatar, yaw, pitch, frame=self._frame)
         with client.atomic():
             client.camera.fov = torch.deg2rad(torch.tensor(_FOV)).item()
             client.camera.up_direction = (0.0, 1.0, 0.0)
