@@ -143,6 +143,7 @@ def photo_light(path: str | Path, head: HeadModel) -> Tensor:
     from uika.canonical.light import absolute_light, sample_light
     from uika.fitting import pixel_uv
 
+    head = head.without_bust
     found = fit_files([path], head)
     fit = found.fit
     assert fit is not None
