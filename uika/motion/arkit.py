@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from uika.head.actions import ARKIT_ACTIONS
+from uika.head.rotations import rodrigues
 from uika.io.files import check_output, replacing
 from uika.motion.action_names import HEAD_ANGLES
 from uika.motion.arkit_json import parse
 from uika.motion.motion import Motion, MotionError
-from uika.motion.recording import Recording, from_file, to_angles
+from uika.motion.recording import Recording, axis_angles, from_file, to_angles
 
 _TIMECODE = re.compile(r"(\d{1,4}):(\d{1,4}):(\d{1,4})[:;.](\d{1,4}(?:\.\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120, 240)  # what the last part of a timecode counts, frames per second
@@ -93,7 +94,7 @@ def write_csv(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
     Raises:
         MotionError: the names are not actions or not one for each column.
     """
-    values, angles = _ordered(motion, names), to_angles(motion)
+    values, angles = _ordered(motion, names), to_angles(_head_turn(motion))
     header = ["timecode", "blendShapeCount", *ARKIT_ACTIONS, *HEAD_ANGLES]
     with replacing(check_output(path, ".csv")) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -125,6 +126,11 @@ def write_json(motion: Motion, path: str | Path, names: Sequence[str]) -> None:
     frames = [dict(zip(ARKIT_ACTIONS, row, strict=True)) for row in _ordered(motion, names).tolist()]
     with replacing(check_output(path, ".json")) as temporary:
         temporary.write_text(json.dumps({"fps": motion.fps, "frames": frames}), encoding="utf-8")
+
+
+def _head_turn(motion: Motion) -> Tensor:
+    """Axis-angle [T,3] of the head, whether root or neck turn it."""
+    return axis_angles(rodrigues(motion.rotation) @ rodrigues(motion.neck))
 
 
 def _ordered(motion: Motion, names: Sequence[str]) -> Tensor:

@@ -178,11 +178,11 @@ def from_angles(angles: Tensor) -> Tensor:
     return axis_angles(rodrigues(yaw) @ rodrigues(pitch) @ rodrigues(roll))
 
 
-def to_angles(motion: Motion) -> Tensor:
-    """Yaw, pitch and roll [T,3] of the head, whether root or neck turn it; the inverse of `from_angles`."""
+def to_angles(rotation: Tensor) -> Tensor:
+    """Yaw, pitch and roll [T,3] of axis-angle vectors [T,3]; the inverse of `from_angles`."""
     from uika.head import rodrigues
 
-    m = rodrigues(motion.rotation) @ rodrigues(motion.neck)
+    m = rodrigues(rotation)
     yaw, roll = torch.atan2(m[:, 0, 2], m[:, 2, 2]), torch.atan2(m[:, 1, 0], m[:, 1, 1])
     return torch.stack((yaw, torch.asin((-m[:, 1, 2]).clamp(-1, 1)), roll), -1)
 
