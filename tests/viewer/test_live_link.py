@@ -3,7 +3,7 @@
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def send(face: LiveLinkFace, *packets: bytes) -> None:
             sender.sendto(data, face.place)
 
 
-def wait(condition, seconds: float = 5.0) -> None:
+def wait(condition: Callable[[], bool], seconds: float = 5.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -102,6 +102,14 @@ def test_late_foreign_and_damaged_packets_change_nothing(face: LiveLinkFace) -> 
     assert "1 late" in face.status and "1 of other senders" in face.status and "2 unusable" in face.status
     send(face, write_packet(packet(0.0, jawOpen=0.3)))  # more than a second back: the sender began anew
     wait(lambda: face.received == 2)
+
+
+def test_the_rate_is_said(face: LiveLinkFace) -> None:
+    for number in range(20):
+        send(face, write_packet(packet(1 + number / 50)))
+        time.sleep(0.02)
+    wait(lambda: face.received == 20)
+    assert 10 < int(face.status.split()[2]) < 60  # 50 a second, less where the machine is slow
 
 
 def test_a_flood_leaves_the_newest(face: LiveLinkFace) -> None:

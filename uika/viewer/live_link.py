@@ -15,7 +15,7 @@ from uika.motion.read import for_head
 _BUFFER = 64 * 1024  # bytes that the system keeps for us: older packets of a flood are lost there
 _SILENT = 2.0  # seconds after which another sender may take over
 _BACK = 1.0  # seconds: a packet that is older by less came late, by more its sender began anew
-_PACE = 0.95  # share of the old value in the running mean of the rate
+_PACE = 0.95  # share of the old value in the running mean of the time between packets
 
 
 class LiveLinkFace:
@@ -43,7 +43,7 @@ class LiveLinkFace:
         self._socket.settimeout(0.2)
         self.received = self.late = self.foreign = self.unusable = 0
         self._newest: FacePacket | None = None
-        self._device, self._heard, self._last, self._rate = "", 0.0, 0.0, 0.0
+        self._device, self._heard, self._last, self._gap = "", 0.0, 0.0, 0.0
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._complaint = ""
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -62,7 +62,8 @@ class LiveLinkFace:
         if not self.received:
             return f"Live Link {address}:{port}: {self._complaint or 'no packet yet'}"
         silent = time.monotonic() - self._heard > _SILENT
-        parts = [f"Live Link: {'silent' if silent else f'{self._rate:.0f} packets/s'}"]
+        rate = f"{1 / self._gap:.0f} packets/s" if self._gap else "first packet"
+        parts = [f"Live Link: {'silent' if silent else rate}"]
         counts = {"late": self.late, "of other senders": self.foreign, "unusable": self.unusable}
         parts += [f"{count} {what}" for what, count in counts.items() if count]
         return ", ".join(parts)
@@ -105,13 +106,13 @@ class LiveLinkFace:
             if self._device and not silent:
                 self.foreign += 1
                 return
-            self._device, self._rate = packet.device, 0.0
+            self._device, self._gap = packet.device, 0.0
         elif not silent and 0 <= self._last - packet.seconds < _BACK:
             self.late += 1
             return
         if self._heard and not silent:
-            rate = 1 / max(now - self._heard, 1e-3)
-            self._rate = rate if not self._rate else _PACE * self._rate + (1 - _PACE) * rate
+            gap = now - self._heard
+            self._gap = _PACE * self._gap + (1 - _PACE) * gap if self._gap else gap
         self._heard, self._last = now, packet.seconds
         self.received += 1
         with self._lock:
