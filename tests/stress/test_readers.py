@@ -128,6 +128,6 @@ def test_pictures_of_too_many_pixels_are_not_decoded(tmp_path: Path) -> None:
 
 def test_many_large_frames_are_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_video(tmp_path / "a.mp4", torch.rand(30, 96, 128, 3), fps=10)
-    monkeypatch.setattr(importlib.import_module("uika.safeguards.verify"), "_PIXELS_KEPT", 4 * 96 * 128)
+    monkeypatch.setattr(importlib.import_module("uika.safeguards.verification"), "_PIXELS_KEPT", 4 * 96 * 128)
     found = verify(tmp_path / "a.mp4")
     assert found.watermark is not None and found.watermark.frames <= 4

@@ -15,18 +15,18 @@ from tests.drjit_splat.training.made_up import write_colmap, write_nerfstudio
 QUICK = TrainConfig(steps=90, random_splats=300, max_splats=400, sh_degree=1, checkpoint_every=30)
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_held_out_photos_are_learned(tmp_path: Path, strategy: str) -> None:
+@pytest.mark.parametrize(("strategy", "steps", "gain"), [("default", 200, 1.0), ("mcmc", 90, 5.0)])
+def test_held_out_photos_are_learned(tmp_path: Path, strategy: str, steps: int, gain: float) -> None:
     capture = open_capture(write_colmap(tmp_path / "data", binary=True))
-    config = replace(QUICK, strategy=strategy)
+    config = replace(QUICK, strategy=strategy, steps=steps)
     untrained = train(capture, tmp_path / "untrained", replace(config, steps=1))
     figures = train(capture, tmp_path / "run", config)
-    assert figures["psnr"] > untrained["psnr"] + 0.8
+    assert figures["psnr"] > untrained["psnr"] + gain
     assert set(figures["held_out"]) == {"000.png", "008.png"} and 0.5 < figures["ssim"] <= 1
     found = load_ply(tmp_path / "run" / "splats.ply")
     assert len(found.means) == figures["splats"] <= 400 and found.degree == 1
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text()) == figures
-    assert [p.step for p in read_log(tmp_path / "run")] == [50, 90]
+    assert [p.step for p in read_log(tmp_path / "run")][-1] == steps
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
