@@ -25,6 +25,7 @@ from uika.motion.frame_times import even_places, is_even, rate_of
 from uika.motion.smoothing import smoothed
 from uika.tracking.appearance import BLURS, LANDMARK_PULL, learn_appearance, track_appearance
 from uika.tracking.decode import VideoError, decode_ahead, frame_rate
+from uika.tracking.eye_region import full_range
 from uika.tracking.poses import poses_between, poses_to_motion, without_gaps
 
 # A frame [H,W,3] sRGB and its face mesh [478,2] in pixels -> the face mesh in better places.
@@ -115,6 +116,7 @@ def track_video(
     start = time.perf_counter()
     frames = counted(decode_ahead(Path(path)), progress, len(seen.landmarks), "follow")
     poses = track_appearance(person, model, rough, targets, (frame.grey for frame in frames), centre)
+    poses = full_range(model, head.expression_names, poses, targets)
     seconds["follow"] = time.perf_counter() - start
     complete = without_gaps(poses, len(seen.landmarks))
     places = np.arange(len(complete), dtype=np.float64) if seen.places is None else seen.places
