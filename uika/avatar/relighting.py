@@ -46,7 +46,8 @@ def relit(avatar: Avatar, head: HeadModel, light: Tensor, *, exposed: bool = Tru
 def splat_normals(avatar: Avatar, head: HeadModel) -> Tensor:
     """Unit normals [M,3] of the resting surface below each Gaussian."""
     vertices = avatar.canonical_vertices(head)
-    corners = vertex_normals(vertices, head.faces)[head.faces[avatar.triangle]]
+    faces = head.faces if len(vertices) == len(head.template) else head.without_bust.faces
+    corners = vertex_normals(vertices, faces)[faces[avatar.triangle]]
     return normalize((corners * avatar.barycentric[..., None]).sum(1), dim=-1, eps=1e-20)
 
 
