@@ -28,7 +28,7 @@ SIZE = 256
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 @pytest.fixture(scope="module")
