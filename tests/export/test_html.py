@@ -44,7 +44,7 @@ def test_page_plays_turns_and_shows_what_the_rasterizer_shows(head, motion, tmp_
     avatar = dataclasses.replace(plain, colors=0.5 + 0.4 * torch.sin(60 * plain.means))
     path = tmp_path / "a.html"
     size = write_html(path, avatar, motion, head)
-    assert size == path.stat().st_size < 5e6
+    assert size == path.stat().st_size < 6e6  # 2 MB of it are what the 52 actions do to each vertex
     with page(tmp_path) as tab:
         tab.open(path.as_uri())
         tab.wait("!!window.avatar")
@@ -110,7 +110,7 @@ def test_page_is_driven_by_scripts_messages_files_and_sound(head, motion, tmp_pa
 
         tab.open(f"{address}/embed.html")
         child = "document.getElementById('f').contentWindow"
-        tab.wait(f"!!{child} && !!{child}.avatar")
+        tab.wait("!!document.getElementById('f')?.contentWindow?.avatar")
         told = "{type: 'avatar', set: {mouthPucker: 0.8}, pose: {yaw: -15}}"
         tab.run(f"{child}.postMessage({told}, '*'); {child}.postMessage('something else', '*')")
         tab.wait("document.getElementById('f').contentDocument.getElementById('play').textContent === 'Play'")

@@ -38,7 +38,7 @@ FACES = {"neutral": {}, "open": {"jawOpen": 0.7}, "smile": {"mouthSmileLeft": 0.
 
 @pytest.fixture(scope="module")
 def head() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +198,15 @@ def test_heads_with_two_tiles_get_two_textures(avatar, head, tmp_path):
     assert np.abs(whole[rows, columns].astype(int) - part[rows, columns]).mean() < 3
     names = [path.name for path in write_obj(tmp_path / "a.obj", avatar, split, size=64)]
     assert names == ["a.mtl", "a_0.png", "a_1.png"]
+
+
+def test_a_bust_is_the_second_tile(tmp_path):
+    whole = load_head()
+    assert whole.bust is not None and uv_tiles(whole).unique().tolist() == [0, 1]
+    avatar = painted_avatar(whole, 64)
+    mesh = write_rigged_glb(tmp_path / "a.glb", avatar, whole, size=64)
+    assert sum(map(len, mesh.faces.values())) == len(whole.faces) and set(mesh.faces) == {0, 1}
+    assert bake_texture(avatar, whole, 1, size=64).min() > 10  # without Gaussians there, the avatar's mean colour
 
 
 def test_nothing_is_half_written(head, tmp_path):

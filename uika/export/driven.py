@@ -49,7 +49,7 @@ def driven_arrays(avatar: Avatar, head: HeadModel) -> dict[str, NDArray[Any]]:
     return {
         "driveRest": rest.numpy(),
         "driveStart": start.astype(np.uint32),
-        "driveVertex": index.numpy().astype(np.uint32),
+        "driveVertex": index.numpy().astype(np.uint32 if len(rest) > 65536 else np.uint16),
         "driveValue": torch.cat(values).short().numpy(),
         "driveStep": steps.numpy(),
         "neckWeight": ((1 - head.lbs_weights[:, 0]).clamp(0, 1) * 255).round().byte().numpy(),

@@ -37,6 +37,9 @@ def bake_texture(avatar: Avatar, head: HeadModel, tile: int = 0, size: int = SIZ
         size: side in texels.
     """
     here = uv_tiles(head)[avatar.triangle] == tile
+    if not bool(here.any()):  # nothing is known of it
+        plain = (avatar.colors.mean(0).clamp(0, 1) * 255).round().byte()
+        return plain.expand(size, size, 3).contiguous().numpy()
     corners = head.uvs[head.uv_faces[avatar.triangle[here]]]
     uv = (corners * avatar.barycentric[here][..., None]).sum(1)
     place = torch.stack((uv[:, 0] - tile, 1 - uv[:, 1]), -1)
