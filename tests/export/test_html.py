@@ -117,8 +117,7 @@ def test_page_is_driven_by_scripts_messages_files_and_sound(head, motion, tmp_pa
         assert psnr(still_of(tab.run(f"{child}.{shown}")), ours({"mouthPucker": 0.8}, -15, 0)) > 38
 
         tab.open(f"{address}/a.html?motion=own.json")
-        tab.wait("!!window.avatar && avatar.driven")
-        tab.run("new Promise((done) => setTimeout(done, 300))")
+        tab.wait("!!window.avatar && avatar.driven && avatar.level('jawOpen') > 0.4")
         assert psnr(still_of(tab.run(shown)), ours({"jawOpen": 0.5}, 0.2 * 180 / np.pi, 0)) > 38
         tab.open(f"{address}/a.html?motion=bad.json")
         tab.wait("document.getElementById('message')?.textContent.startsWith('bad.json: ')")
@@ -129,7 +128,7 @@ def test_page_is_driven_by_scripts_messages_files_and_sound(head, motion, tmp_pa
         tab.open((tmp_path / "site" / "a.html").as_uri() + "?motion=own.json")
         tab.wait("document.getElementById('message')?.textContent.includes('drop the file')")
         tab.run("avatar.motion('[{\"jawOpen\": 0.5}]')")
-        tab.run("new Promise((done) => setTimeout(done, 300))")
+        tab.wait("avatar.level('jawOpen') > 0.4")
         assert psnr(still_of(tab.run(shown)), ours({"jawOpen": 0.5}, 0, 0)) > 38
 
 

@@ -241,7 +241,7 @@
     level: (name) => face.weights[face.names.indexOf(name)],
     set: (values) => { drive(); return face.set(values); },
     pose: (values) => { drive(); face.pose(values); },
-    motion: (text) => { given = motionFrames(text); driven = true; play(true); },
+    motion: (text) => { given = motionFrames(text); driven = true; show(given.frames[0]); play(true); },
     listen: async () => {
       if (stopListening) return;
       stopListening = await microphoneLevel((level) => avatar.set({ jawOpen: 0.45 * level, mouthLowerDown: 0.3 * level }));
