@@ -77,3 +77,18 @@ def test_corners_outside_the_mesh_are_named(face: str, says: str, tmp_path: Path
     mesh.write_text(_edit_line(mesh.read_text(), "f ", lambda _: face))
     with pytest.raises(HeadError, match=rf"mesh\.obj: a triangle names {says}"):
         read_flame(tmp_path / "model.npz", mesh)
+
+
+@pytest.mark.parametrize(
+    ("start", "says"),
+    [
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 53023716\n", "a Git LFS pointer"),
+        ("<!DOCTYPE html><html><body>Sign in</body></html>", "a web page"),
+        ("\n<html lang='en'>", "a web page"),
+        ('<?xml version="1.0"?><Error>AccessDenied</Error>', "a web page"),
+    ],
+)
+def test_what_a_download_left_instead_is_named(start: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "model.pkl").write_text(start)
+    with pytest.raises(HeadError, match=rf"model\.pkl: is {says}, not the model file"):
+        read_flame(tmp_path / "model.pkl")

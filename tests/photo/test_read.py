@@ -188,3 +188,14 @@ def test_damaged_colour_profile_is_ignored(tmp_path: Path) -> None:
     plain = Image.new("RGB", (64, 64), (200, 90, 40))
     plain.save(tmp_path / "odd.png", icc_profile=b"no profile at all")
     assert tuple(read(tmp_path / "odd.png").rgb[0, 0]) == (200, 90, 40)
+
+
+@pytest.mark.parametrize("kind", ["AVIF", "GIF", "TIFF"])
+def test_kinds_that_are_not_read_are_said_to_be_none(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{kind.lower()}"
+    try:
+        Image.new("RGB", (96, 96), (10, 90, 30)).save(path, kind)
+    except (KeyError, OSError):
+        pytest.skip(f"skipped: this Pillow writes no {kind}")
+    with pytest.raises(PhotoError, match="is not a readable photo; save it as JPEG, PNG, WebP or HEIC"):
+        read(path)

@@ -13,7 +13,7 @@ import torch
 from tests.filmed import act_pictures
 from uika.head import HeadModel, load_head, rodrigues
 from uika.tracking import VideoError, track_video, video_frames, write_preview
-from uika.tracking.decode import decode, decode_ahead
+from uika.tracking.decode import decode, decode_ahead, frame_rate
 
 ONE = 1 << 16
 # What is done to a picture before it is stored -> the display matrix (a, b, c, d) that undoes it.
@@ -117,3 +117,39 @@ def test_a_motion_lasts_as_long_as_its_video(kept: str, head: HeadModel, tmp_pat
     at = torch.tensor([k for k in frames if k < shared])
     assert float(torch.rad2deg((angle[at] - yaw[at]).abs()).median()) < 6.0
     assert write_preview(found, video, tmp_path / "p.mp4", head) == len(found.motion)
+
+
+def with_cover(path: Path, film: bool) -> Path:
+    """A film or a song whose first stream of pictures is a red cover."""
+    with av.open(str(path), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.height, cover.width, cover.pix_fmt = 96, 96, "yuvj420p"
+        cover.disposition = av.stream.Disposition.attached_pic
+        other = container.add_stream("libx264" if film else "aac", rate=25 if film else 48000)
+        if film:
+            other.height, other.width, other.pix_fmt = 48, 64, "yuv420p"
+        for packet in cover.encode(av.VideoFrame.from_ndarray(np.full((96, 96, 3), (250, 0, 0), np.uint8))):
+            container.mux(packet)
+        container.mux(cover.encode(None))
+        for _ in range(3):
+            if film:
+                container.mux(other.encode(av.VideoFrame.from_ndarray(picture(), format="rgb24")))
+            else:
+                sound = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), format="fltp", layout="stereo")
+                sound.rate = 48000
+                container.mux(other.encode(sound))
+        container.mux(other.encode(None))
+    return path
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.mkv", "film.mov"])
+def test_a_films_cover_is_not_its_first_frame(name: str, tmp_path: Path) -> None:
+    path = with_cover(tmp_path / name, film=True)
+    assert [frame.shape for frame in video_frames(path)] == [(48, 64, 3)] * 3
+    assert frame_rate(path) == pytest.approx(25, rel=0.3)
+
+
+@pytest.mark.parametrize("name", ["song.mp4", "song.mov", "song.mkv"])
+def test_a_songs_cover_is_no_video(name: str, tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="has no moving pictures in it"):
+        list(decode(with_cover(tmp_path / name, film=False)))

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from uika.head.model import JOINT_PARENTS, HeadError, HeadModel
 from uika.head_import.unpickle import UnpickleError, read_arrays
+from uika.io.files import stands_for_another
 from uika.io.npz import ArraysError, read_npy, read_npz
 
 VERTICES = 5023
@@ -102,6 +103,8 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
             raise HeadError(f"{source}: cannot be read as an .npz of plain arrays: {error}") from error
     if source.suffix == ".npz":
         raise HeadError(f"{source}: is damaged or no .npz file; fetch it again")
+    if stand_in := stands_for_another(source):
+        raise HeadError(f"{source}: is {stand_in}, not the model file; download the file itself")
     try:
         return read_arrays(source)
     except UnpickleError as error:

@@ -51,6 +51,15 @@ def check_folder(path: str | Path) -> Path:
     return folder
 
 
+def stands_for_another(path: Path) -> str:
+    """What a download left in the place of a file: "a web page" or "a Git LFS pointer"; empty if neither."""
+    with path.open("rb") as file:
+        start = file.read(256).lstrip().lower()
+    if start.startswith(b"version https://git-lfs"):
+        return "a Git LFS pointer"
+    return "a web page" if start.startswith((b"<!doctype html", b"<html", b"<?xml")) else ""
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` with its extension; renamed to `path` at the end, removed after an error."""

@@ -113,7 +113,7 @@ def _open(data: bytes) -> Any:
     try:
         return Image.open(io.BytesIO(data), formats=FORMATS)
     except UnidentifiedImageError:
-        if data[4:8] != b"ftyp":
+        if data[4:8] != b"ftyp" or data[8:12] in (b"avif", b"avis"):
             raise
     try:
         from pillow_heif import HeifImageFile

@@ -15,6 +15,7 @@ from uika.errors import UikaError
 from uika.io.media import open_media
 from uika.io.upright import shown_width, upright
 
+_STILL_CODECS = ("mjpeg", "png", "bmp", "webp", "gif")
 AHEAD = 8  # frames
 DEFAULT_FPS = 25.0  # where the file does not say
 MAX_PIXELS = 36_000_000  # of a frame; 8K has fewer
@@ -54,11 +55,10 @@ def decode(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
         raise VideoError(f"{path}: no such video")
     try:
         with open_media(path) as container:
-            if not container.streams.video:
-                raise VideoError(f"{path}: has no pictures in it")
-            container.streams.video[0].thread_type = "AUTO"
-            aspect, size = container.streams.video[0].sample_aspect_ratio, None
-            for frame in container.decode(video=0):
+            stream = _moving(path, container)
+            stream.thread_type = "AUTO"
+            aspect, size = stream.sample_aspect_ratio, None
+            for frame in container.decode(stream):
                 width = shown_width(frame, aspect)
                 if width * frame.height > MAX_PIXELS:
                     raise VideoError(f"{path}: has {width}x{frame.height} pixels a frame; {MAX_PIXELS:,} are the most")
@@ -76,6 +76,21 @@ def decode(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
     except (av.FFmpegError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise VideoError(f"{path}: cannot be read as a video ({reason})") from error
+
+
+def _moving(path: Path, container: Any) -> Any:
+    """The stream of moving pictures; covers of songs and films are still ones that FFmpeg lists among them."""
+    moving = [stream for stream in container.streams.video if not _is_cover(stream)]
+    if not moving:
+        covers = " besides its cover" if container.streams.video else ""
+        raise VideoError(f"{path}: has no moving pictures in it{covers}")
+    films = [stream for stream in moving if stream.codec_context.name not in _STILL_CODECS]
+    return (films or moving)[0]  # Matroska files do not always say that a picture is a cover
+
+
+def _is_cover(stream: Any) -> bool:
+    disposition = getattr(stream, "disposition", None)
+    return disposition is not None and "attached_pic" in str(getattr(disposition, "name", disposition))
 
 
 def decode_ahead(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
@@ -122,7 +137,7 @@ def frame_rate(path: Path) -> float:
 
     try:
         with open_media(path) as container:
-            rate = container.streams.video[0].average_rate
+            rate = _moving(path, container).average_rate
     except (av.FFmpegError, OSError, LookupError) as error:
         raise VideoError(f"{path}: cannot be read as a video ({error})") from error
     return float(rate) if rate else DEFAULT_FPS
