@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+from tests.avatars import painted_avatar
+from uika.errors import UikaWarning
+from uika.head import load_head
 from uika.photo import PhotoError, prepare
 from uika.photo.detect import find_face
-from uika.photo.trust import doubt, turned_by
+from uika.photo.trust import judge, turned_by
+from uika.reconstruction.photos_to_avatar import with_doubts
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +91,26 @@ def test_spoiled_faces_are_right_or_refused(
     for amount in amounts:
         photo, want = spoiled(image, truth, how, amount)
         found = find_face(photo)
-        refused.append(found is None or bool(doubt(photo, found)))
+        refused.append(found is None or bool(judge(photo, found).problem))
         if found is not None and not refused[-1]:
             assert np.linalg.norm(found - want, axis=1).mean() < 0.03 * np.ptp(truth[:, 1]), amount
     assert not refused[0] and refused[-1] and refused == sorted(refused)
+
+
+@pytest.mark.parametrize("scores", [[0.8, 0.1, 0.2, 0.3], [1.1, 0.0, 0.0, 0.0], [0.9, 0.9, 0.9, 0.9]])
+def test_faces_that_the_detectors_hardly_take_for_a_persons_are_spoken_of(
+    scores: list[float], image: Image.Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("uika.photo.trust.face_scores", lambda _: scores)  # no animal's picture is kept here
+    image.save(tmp_path / "dog.png")
+    with pytest.warns(UikaWarning, match=r"dog\.png: its face hardly looks like a person's"):
+        photo = prepare(tmp_path / "dog.png", 128)
+    assert not photo.person
+    made = with_doubts(painted_avatar(load_head(), 8), [photo])
+    assert photo.sha256 in made.provenance["face"]
+
+
+def test_a_person_is_nothing_to_speak_of(portrait_path: Path) -> None:
+    photo = prepare(portrait_path, 128)
+    avatar = painted_avatar(load_head(), 8)
+    assert photo.person and with_doubts(avatar, [photo]) is avatar

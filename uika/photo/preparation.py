@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from uika.errors import UikaWarning
 from uika.photo import matte
 from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
 from uika.photo.detect import find_face
@@ -18,7 +20,7 @@ from uika.photo.foreground import estimate_foreground
 from uika.photo.networks import person_mask
 from uika.photo.outline import CHIN, FOREHEAD, MOUTH_CORNERS, OVAL, face_frame, polygon
 from uika.photo.read import Picture, read
-from uika.photo.trust import doubt
+from uika.photo.trust import judge
 
 HEAD_TO_FACE = 1.35  # height of a head over the height of its face, forehead line to chin
 CROP_TO_HEAD = 1.5  # side of the crop over the larger side of the head box (released inference settings)
@@ -54,6 +56,7 @@ class Photo:
     original [3,S,S] float32, the crop with its own background;
     focal length in crop pixels if the file tells it;
     bust, a wider crop if it was asked for.
+    person: whether the face looks like a person's rather than, say, an animal's.
     """
 
     path: str
@@ -65,6 +68,7 @@ class Photo:
     original: Tensor
     focal: float | None = None
     bust: BustCrop | None = None
+    person: bool = True
 
 
 def prepare(
@@ -92,8 +96,13 @@ def prepare(
         raise PhotoError(
             path, "no face is found in it; use an upright, sharp photo with the whole face in view, 50 px high or more"
         )
-    if problem := doubt(rgb, face):
-        raise PhotoError(path, problem)
+    trust = judge(rgb, face)
+    if trust.problem:
+        raise PhotoError(path, trust.problem)
+    if not trust.person:
+        warnings.warn(
+            f"{path}: its face hardly looks like a person's (an animal, or hidden?)", UikaWarning, stacklevel=2
+        )
     square = _head_square(rgb, face)
     landmarks = to_crop(face, square, size)
     crop, alpha, colours, inside = _cut_out(picture, rgb, square, landmarks, size)
@@ -108,6 +117,7 @@ def prepare(
         original=_chw(plain + inside[..., None] * (crop.astype(np.float32) / 255 - plain)),
         focal=None if picture.focal is None else picture.focal * size / square[2],
         bust=_bust_crop(picture, rgb, square, face, size, plain) if bust else None,
+        person=trust.person,
     )
 
 

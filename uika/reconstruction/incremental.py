@@ -13,7 +13,7 @@ from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_prepared, prepare_files
 from uika.reconstruction.models import check_loaded, load_model
-from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble
+from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble, with_doubts
 from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
@@ -105,4 +105,4 @@ class GrowingAvatar:
             avatar = with_bust(avatar, self._head, [group.fit for group in groups if group.fit], photos, report)
         self._photos = [*self._photos, *new] if before else list(new)
         self._first, self._groups = (fit, canonical), groups
-        return avatar
+        return with_doubts(avatar, photos)

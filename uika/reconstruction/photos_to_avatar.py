@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,7 +84,16 @@ def reconstruct(
     )
     if bust and observed.fit is not None:
         avatar = with_bust(avatar, head, [observed.fit], observed.photos, report)
-    return Reconstruction(avatar, observed.photos, observed.fit, report)
+    return Reconstruction(with_doubts(avatar, observed.photos), observed.photos, observed.fit, report)
+
+
+def with_doubts(avatar: Avatar, photos: Sequence[Photo]) -> Avatar:
+    """The avatar with a note in its provenance if a photo's face hardly looked like a person's."""
+    doubtful = [photo.sha256 for photo in photos if not photo.person]
+    if not doubtful:
+        return avatar
+    note = f"hardly looks like a person's in {' '.join(doubtful)}"
+    return replace(avatar, provenance={**avatar.provenance, "face": note})
 
 
 @torch.no_grad()
