@@ -1,7 +1,7 @@
 """The demo portrait, spoiled 200 times: `python -m tests.stress.perturbed [--prepare-only]`.
 
-Each spoiled photo goes through `uika.reconstruct`, or its first stage, which finds the landmarks. It must be refused, or
-its landmarks must lie where the untouched portrait's are carried by the same change, within 3 % of the face's height.
+Each spoiled photo goes through `uika.reconstruct`, or its first stage, which finds the landmarks. It must be refused,
+or its landmarks must lie where the untouched portrait's are carried by the same change, within 3 % of its height.
 """
 
 from __future__ import annotations
