@@ -33,6 +33,7 @@ def pencil(image: Image.Image) -> Image.Image:
     return Image.fromarray((grey * 255 / (256 - soft).clip(1)).clip(0, 255).astype(np.uint8)).convert("RGB")
 
 
+@pytest.mark.filterwarnings("ignore:.*hardly looks like a person's:uika.errors.UikaWarning")
 @pytest.mark.parametrize("draw", [cartoon, painting, pencil])
 def test_drawn_faces_are_found_and_cut_out(draw, tmp_path: Path) -> None:
     photo = ImageOps.exif_transpose(Image.open(PORTRAIT)).convert("RGB")

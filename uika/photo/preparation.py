@@ -94,7 +94,8 @@ def prepare(
     face = find_face(rgb)
     if face is None:
         raise PhotoError(
-            path, "no face is found in it; use an upright, sharp photo with the whole face in view, 50 px high or more"
+            path,
+            "shows no face that is found; use an upright, sharp photo with the whole face, 50 px high or more",
         )
     trust = judge(rgb, face)
     if trust.problem:
