@@ -37,7 +37,6 @@ from uika.head import (
     uv_texels,
 )
 from uika.metrics import mask_iou, psnr
-from uika.photo import head_matte
 from uika.reconstruction import Reconstruction, reconstruct
 
 VIEWS = (0.0, 35.0, -35.0, 15.0)  # yaw of the synthetic photos, degrees
@@ -49,7 +48,7 @@ class PortraitFigures:
     """Agreement of an avatar with its own photo, at the photo's camera and expression."""
 
     face_psnr: float  # dB inside the skin of the face
-    silhouette_iou: float  # splat alpha against the matte of head and hair, above the chin line
+    silhouette_iou: float  # splat alpha against the person's matte
     landmark_percent: float  # mean landmark distance in percent of the distance of the outer eye corners
     gaussians: int
 
@@ -83,7 +82,7 @@ def portrait_figures(result: Reconstruction, head: HeadModel, photo: int = 0) ->
     distance = (project(head.landmarks(vertices), camera)[0] - marks).norm(dim=-1).mean()
     figures = PortraitFigures(
         face_psnr=psnr(picture.rgb, image, face_mask(head, vertices, camera)),
-        silhouette_iou=mask_iou(picture.alpha, head_matte(source)),
+        silhouette_iou=mask_iou(picture.alpha, source.matte),
         landmark_percent=float(100 * distance / (corners[0] - corners[1]).norm()),
         gaussians=len(avatar.means),
     )
@@ -156,8 +155,8 @@ def photos_figures(truth: Avatar, head: HeadModel, counts: Sequence[int] = (1, 2
             Image.fromarray((photograph(truth, head, yaw)[0].numpy() * 255).round().astype(np.uint8)).save(path)
             paths.append(path)
         for count in counts:
-            result = reconstruct(paths[:count], head)
-            back = reconstruct(paths[:count][::-1], head)
+            result = reconstruct(paths[:count], head, photo_splats=False)
+            back = reconstruct(paths[:count][::-1], head, photo_splats=False)
             figures.append(
                 PhotosFigures(
                     photos=count,
@@ -214,8 +213,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     head = load_head().without_bust
     result = reconstruct([PORTRAIT], head)
     portrait, picture = portrait_figures(result, head)
-    mesh = mesh_figures(result.avatar, head)
-    photos = photos_figures(result.avatar, head, arguments.photos)
+    surface = reconstruct([PORTRAIT], head, photo_splats=False).avatar  # Mitsuba knows the mesh alone
+    mesh = mesh_figures(surface, head)
+    photos = photos_figures(surface, head, arguments.photos)
     source = result.photos[0].image.permute(1, 2, 0)
     error = (picture - source).abs().mean(-1, keepdim=True).mul(4).clamp(0, 1).expand(-1, -1, 3)
     strip = (torch.cat((source, picture, error), 1).clamp(0, 1) * 255).round().to(torch.uint8)
@@ -236,7 +236,7 @@ def _markdown(portrait: PortraitFigures, mesh: list[MeshFigures], photos: list[P
         "| portrait, at its own camera | |",
         "|---|---|",
         f"| PSNR inside the face | {portrait.face_psnr:.2f} dB |",
-        f"| silhouette against the matte of head and hair (IoU) | {portrait.silhouette_iou:.3f} |",
+        f"| silhouette against the person's matte (IoU) | {portrait.silhouette_iou:.3f} |",
         f"| landmarks, mean, of the distance of the outer eye corners | {portrait.landmark_percent:.2f} % |",
         f"| Gaussians | {portrait.gaussians:,} |",
         "",

@@ -26,6 +26,7 @@ PACKAGES: dict[str, set[str]] = {
     "uika.model": {"uika.canonical", "uika.uv", "uika.head", "uika.io"},
     "uika.motion": {"uika.head", "uika.io", "uika.assets"},
     "uika.avatar": {"uika.head", "uika.motion", "uika.io", "drjit_splat"},
+    "uika.photo_splats": {"uika.avatar", "uika.head"},
     "uika.tracking": {"uika.fitting", "uika.motion", "uika.avatar", "uika.head", "uika.photo", "uika.io"},
     "uika.export": {"uika.avatar", "uika.motion", "uika.head", "uika.io", "drjit_splat"},
     "uika.safeguards": {"uika.avatar", "uika.export", "uika.io"},

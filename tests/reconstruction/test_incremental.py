@@ -32,9 +32,10 @@ def photos(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
 
 
 def test_growing_ends_where_everything_at_once_does(photos: list[Path], head: HeadModel) -> None:
-    growing, whole = GrowingAvatar(head=head), reconstruct(photos, head).avatar
+    growing, whole = GrowingAvatar(head=head, photo_splats=False), reconstruct(photos, head, photo_splats=False).avatar
     first = growing.add(photos[:2])
-    torch.testing.assert_close(first.means, reconstruct(photos[:2], head).avatar.means, rtol=0, atol=1e-5)
+    alone = reconstruct(photos[:2], head, photo_splats=False).avatar
+    torch.testing.assert_close(first.means, alone.means, rtol=0, atol=1e-5)
     report = Report()
     grown = growing.add(photos[2:], report)
     assert len(growing) == 3
@@ -60,8 +61,20 @@ def test_a_photo_that_cannot_be_used_changes_nothing(photos: list[Path], head: H
 
 
 def test_the_untrained_way_grows_too(photos: list[Path], head: HeadModel) -> None:
-    growing = GrowingAvatar("none", head)
+    growing = GrowingAvatar("none", head, photo_splats=False)
     first = growing.add(photos[:1])
-    assert_same_avatar(first, reconstruct(photos[:1], head, "none").avatar)
+    assert_same_avatar(first, reconstruct(photos[:1], head, "none", photo_splats=False).avatar)
     assert (growing.add(photos[2:]).colors - first.colors).abs().max() > 0.05
-    assert_same_avatar(growing.refresh(), reconstruct([photos[0], *photos[2:]], head, "none").avatar)
+    whole = reconstruct([photos[0], *photos[2:]], head, "none", photo_splats=False).avatar
+    assert_same_avatar(growing.refresh(), whole)
+
+
+def test_photo_splats_grow_too(photos: list[Path], head: HeadModel) -> None:
+    growing, report = GrowingAvatar("none", head), Report()
+    counts = []
+    for each in photos[:2]:
+        avatar = growing.add([each], report)
+        counts.append(report.counts["photo_splats"])
+        assert avatar.provenance["photo_splats"] == str(counts[-1])
+        assert len(avatar) - counts[-1] > 100_000
+    assert 0 < counts[0] < counts[1]

@@ -12,6 +12,7 @@ from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.head import HeadModel, HeadParameters, load_head, look_at, project, uv_texels
 from uika.model import build, save_checkpoint
+from uika.photo_splats import LIMIT
 from uika.reconstruction import Reconstruction, Report, avatar_from_fit, load_model, reconstruct
 from uika.reconstruction.bust import wider_camera
 
@@ -24,6 +25,12 @@ def head() -> HeadModel:
 @pytest.fixture(scope="module")
 def portrait(head: HeadModel) -> Reconstruction:
     return reconstruct([PORTRAIT], head)
+
+
+@pytest.fixture(scope="module")
+def surface(head: HeadModel) -> Reconstruction:
+    """Without photo splats: what the mesh can show."""
+    return reconstruct([PORTRAIT], head, photo_splats=False)
 
 
 def test_avatar_looks_like_its_photo(portrait: Reconstruction, head: HeadModel) -> None:
@@ -45,8 +52,8 @@ def test_hair_is_kept(portrait: Reconstruction, head: HeadModel) -> None:
     assert with_hair > 0.15 * 256 * 256
 
 
-def test_splats_agree_with_mitsuba(portrait: Reconstruction, head: HeadModel) -> None:
-    for figures in mesh_figures(portrait.avatar, head):
+def test_splats_agree_with_mitsuba(surface: Reconstruction, head: HeadModel) -> None:
+    for figures in mesh_figures(surface.avatar, head):
         print(figures)
         assert figures.mask_iou >= 0.95
         assert figures.depth_median_mm <= 3.0
@@ -63,8 +70,8 @@ def test_network_at_its_start_keeps_the_surface(portrait: Reconstruction, head: 
     assert (plain.colors - start.colors).abs().max() < 2e-3
 
 
-def test_built_in_network_changes_colours_of_the_face_alone(portrait: Reconstruction, head: HeadModel) -> None:
-    plain, trained = reconstruct([PORTRAIT], head, model="none").avatar, portrait.avatar
+def test_built_in_network_changes_colours_of_the_face_alone(surface: Reconstruction, head: HeadModel) -> None:
+    plain, trained = reconstruct([PORTRAIT], head, "none", photo_splats=False).avatar, surface.avatar
     for name in ("means", "quats", "scales", "opacities"):
         torch.testing.assert_close(getattr(trained, name), getattr(plain, name), rtol=0, atol=1e-7)
     change = (plain.colors - trained.colors).abs().mean(-1)
@@ -72,6 +79,25 @@ def test_built_in_network_changes_colours_of_the_face_alone(portrait: Reconstruc
     face = (head.masks["face"][head.faces[binding.triangle]] * binding.barycentric).sum(-1)
     assert change[face == 0].max() < 1e-6
     assert 0 < change[face > 0.9].median() < 0.04
+
+
+def test_photo_splats_show_the_person_outside_the_surface(
+    portrait: Reconstruction, surface: Reconstruction, head: HeadModel, tmp_path: Path
+) -> None:
+    count = portrait.report.counts["photo_splats"]
+    assert 1_000 < count <= LIMIT
+    assert portrait.avatar.provenance["photo_splats"] == str(count)
+    plain = surface
+    assert "photo_splats" not in plain.report.counts
+    assert len(portrait.avatar) == len(plain.avatar) + count
+    photo, errors, sizes = portrait.photos[0], [], []
+    for result in (plain, portrait):
+        shown = render(result.avatar, result.fit.parameters[0], result.fit.cameras[0], head)
+        errors.append((shown.rgb.permute(2, 0, 1) - photo.image).square().mean())
+        result.avatar.save(tmp_path / "avatar.safetensors")
+        sizes.append((tmp_path / "avatar.safetensors").stat().st_size)
+    assert errors[1] < 0.4 * errors[0]
+    assert sizes[1] <= 1.5 * sizes[0]
 
 
 def test_avatar_survives_its_file(portrait: Reconstruction, tmp_path: Path) -> None:
@@ -82,24 +108,24 @@ def test_avatar_survives_its_file(portrait: Reconstruction, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_any_number_of_photos(portrait: Reconstruction, head: HeadModel) -> None:
-    for figures in photos_figures(portrait.avatar, head, counts=(1, 2, 4)):
+def test_any_number_of_photos(surface: Reconstruction, head: HeadModel) -> None:
+    for figures in photos_figures(surface.avatar, head, counts=(1, 2, 4)):
         print(figures)
         assert figures.seen_psnr >= 20
 
 
-def test_two_photos_of_a_known_head(portrait: Reconstruction, head: HeadModel, tmp_path: Path) -> None:
+def test_two_photos_of_a_known_head(surface: Reconstruction, head: HeadModel, tmp_path: Path) -> None:
     from PIL import Image
 
     paths = []
     for yaw in (0.0, 30.0):
-        picture = photograph(portrait.avatar, head, yaw, spp=16)[0]
+        picture = photograph(surface.avatar, head, yaw, spp=16)[0]
         paths.append(tmp_path / f"view{yaw:.0f}.png")
         Image.fromarray((picture * 255).round().to(torch.uint8).numpy()).save(paths[-1])
-    result = reconstruct(paths, head)
+    result = reconstruct(paths, head, photo_splats=False)
     assert len(result.fit.error) == 2
     assert result.fit.error.max() < 0.03
-    back = reconstruct(paths[::-1], head)
+    back = reconstruct(paths[::-1], head, photo_splats=False)
     assert [photo.sha256 for photo in back.photos] == [photo.sha256 for photo in result.photos]
     assert_same_avatar(back.avatar, result.avatar)
 

@@ -52,11 +52,17 @@ def prior_colors(
         if name in head.masks:
             seen = seen * (1 - mask_at_texels(head, binding, name))
     hair = _hairiness(head, static_offset)
-    vertices = _continue(head, *texels_to_vertices(head, binding, observed, seen), hair)
+    at_vertices, share = texels_to_vertices(head, binding, observed, seen)
+    face = head.masks["face"] if "face" in head.masks else 1 - hair
+    skin = _typical(at_vertices, share * face * (hair < _BARE))
+    strand = _typical_hair(at_vertices, share * (hair > 0.5), skin)
+    vertices = _continue(head, at_vertices, share, torch.lerp(skin, strand, hair[:, None]))
     result = at_texels(head, binding, vertices)
     points = at_texels(head, binding, head.template)
     hairy = at_texels(head, binding, hair[:, None])[:, 0] * (labels == 0)
-    result = (result + reflected_hair_detail(points, observed, result, seen, hairy)).clamp(0, 1)
+    # Skin between strands lends nothing to the side that no photo shows.
+    like_hair = (observed - strand).norm(dim=-1) <= (observed - skin).norm(dim=-1)
+    result = (result + reflected_hair_detail(points, observed, result, seen * like_hair, hairy)).clamp(0, 1)
     # No skin may appear where lids and lips open.
     known_share = binding.from_map(known[None])[:, 0]
     shown = tone(observed, known_share, (labels == 0) & (hairy < _BARE))
@@ -96,8 +102,8 @@ def _hairiness(head: HeadModel, static_offset: Tensor) -> Tensor:
     return hair * ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1)
 
 
-def _continue(head: HeadModel, color: Tensor, seen: Tensor, hair: Tensor) -> Tensor:
-    """Harmonic continuation [V,3] of vertex colours over the mesh from where they were seen, drawn to their kind."""
+def _continue(head: HeadModel, color: Tensor, seen: Tensor, kind: Tensor) -> Tensor:
+    """Harmonic continuation [V,3] of vertex colours over the mesh from where they were seen, drawn to `kind` [V,3]."""
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import splu
 
@@ -105,12 +111,9 @@ def _continue(head: HeadModel, color: Tensor, seen: Tensor, hair: Tensor) -> Ten
     row, column = torch.cat((head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]])).numpy().T
     graph = coo_matrix((np.ones(len(row)), (row, column)), shape=(count, count))
     graph = (graph + graph.T).tocsr()
-    face = head.masks["face"] if "face" in head.masks else 1 - hair
-    skin = _typical(color, seen * face * (hair < _BARE))
-    kind = torch.lerp(skin, _typical(color, seen * (hair > 0.5)), hair[:, None]).double().numpy()
     pull = _SOURCE * (2 * seen - 1).clamp_min(0).double().numpy()[:, None]
     system = diags(np.asarray(graph.sum(1)).ravel() + pull[:, 0] + _KIND_PULL) - graph
-    solved = splu(system.tocsc()).solve(pull * color.double().numpy() + _KIND_PULL * kind)
+    solved = splu(system.tocsc()).solve(pull * color.double().numpy() + _KIND_PULL * kind.double().numpy())
     return torch.from_numpy(solved).float().clamp(0, 1)
 
 
@@ -118,6 +121,18 @@ def _typical(color: Tensor, seen: Tensor) -> Tensor:
     """Median [3] of the colours that were seen well; grey when there are none."""
     chosen = color[seen > 0.5]
     return chosen.median(0).values if len(chosen) else torch.full((3,), _DEFAULT)
+
+
+def _typical_hair(color: Tensor, seen: Tensor, skin: Tensor) -> Tensor:
+    """Median [3] of the half of the colours seen well that is less like skin [3]; grey when there are none.
+
+    Where hair should be, photos show forehead, ears and neck too, if the fit is a little off or the hair is thin.
+    """
+    chosen = color[seen > 0.5]
+    if not len(chosen):
+        return torch.full((3,), _DEFAULT)
+    distance = (chosen - skin).norm(dim=-1)
+    return chosen[distance >= distance.median()].median(0).values
 
 
 def reflected_hair_detail(points: Tensor, color: Tensor, smooth: Tensor, seen: Tensor, hair: Tensor) -> Tensor:

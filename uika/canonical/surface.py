@@ -25,7 +25,7 @@ FOOTPRINT = 0.7  # standard deviation over the distance of neighbouring texels: 
 SEAM = 1.4  # enlarges splats at the edge of a chart, whose neighbours beyond the seam are moved apart from them
 FLATNESS = 0.1  # standard deviation along the normal over the mean tangential one
 _SIZE_RANGE = (2e-5, 1e-2)  # metres, of a texel's side: keeps slivers of the atlas from vanishing or exploding
-_CURVATURE, _MAX_LIFT = 0.75, 4e-3  # share of the full tangent-plane lift, and its limit in metres
+SINK = 0.5  # standard deviations below the surface: nearer splats cover those behind, which shows it too far out
 _MIRROR_TOLERANCE = 3e-3  # metres between a mirrored vertex and the vertex it stands for
 
 
@@ -67,8 +67,8 @@ def surface_texels(
     """Place a flat splat on the head surface at every covered texel of a `size` x `size` atlas; a bust gets none.
 
     Each splat follows its texel's footprint on the surface, stretched and turned as the atlas is there, so that
-    neighbours overlap wherever the atlas is uneven. Centres lie on a surface that curves between the vertices, so that
-    the coarse triangles of the scalp leave no corners in an outline.
+    neighbours overlap wherever the atlas is uneven. Centres lie a little below the surface, so that a picture of the
+    splats shows colours and outline where the surface has them.
 
     Args:
         head: the head model.
@@ -114,10 +114,11 @@ def canonical_binding(head: HeadModel, canonical: str, size: int) -> Binding:
 
 def closing_splats(head: HeadModel, vertices: Tensor, binding: Binding) -> tuple[Tensor, Tensor, Tensor]:
     """Centres [M,3], rotations [M,4] and sizes [M,3] of flat splats at texels that close a mesh [V,3]."""
-    points = _curved(vertices, head.faces, binding, surface_points(vertices, head.faces, binding))
+    points = surface_points(vertices, head.faces, binding)
     frames, sides = _texel_frames(head, vertices, binding, points)
     sides = torch.where(_at_seam(binding)[:, None], SEAM * sides, sides)
     scales = torch.cat((FOOTPRINT * sides, FLATNESS * FOOTPRINT * sides.mean(-1, keepdim=True)), -1)
+    points = points - SINK * scales[:, :2].mean(-1, keepdim=True) * frames[..., 2]
     return points, matrices_to_quaternions(frames), scales
 
 
@@ -133,16 +134,6 @@ def _lift(head: HeadModel, neutral: HeadParameters, static_offset: Tensor, bindi
     normals = torch.nn.functional.normalize(vertex_normals(bald, head.faces), dim=-1)
     height = (static_offset * normals).sum(-1)[head.faces[binding.triangle]]
     return binding.to_map((height * binding.barycentric).sum(-1, keepdim=True))
-
-
-def _curved(vertices: Tensor, faces: Tensor, binding: Binding, points: Tensor) -> Tensor:
-    """Phong tessellation: points [M,3] drawn towards the tangent planes of their triangles' corners."""
-    corners = faces[binding.triangle]
-    normals = torch.nn.functional.normalize(vertex_normals(vertices, faces), dim=-1)[corners]
-    height = ((points[:, None] - vertices[corners]) * normals).sum(-1)
-    lift = -(binding.barycentric[..., None] * height[..., None] * normals).sum(1)
-    # Where normals turn by more than a tangent plane can tell (lips, ears), the flat triangle is the better guess.
-    return points + _CURVATURE * lift * (_MAX_LIFT / lift.norm(dim=-1, keepdim=True).clamp_min(_MAX_LIFT))
 
 
 @lru_cache(maxsize=4)

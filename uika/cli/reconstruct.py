@@ -34,6 +34,8 @@ class Reconstruct:
     """Refine face shape and poses with the colours that two or more photos share."""
     keep: Literal["all", "foreground"] = "all"
     """foreground leaves out patches without head: quicker from several photos, nearly the same."""
+    photo_splats: bool = True
+    """Add splats for what the photos show outside the fitted surface: strands, collars, hats."""
     consent: bool = False
     """State in the avatar's provenance that the person shown agrees."""
 
@@ -52,6 +54,7 @@ class Reconstruct:
             backbone=self.backbone,
             refine=self.refine,
             keep=self.keep,
+            photo_splats=self.photo_splats,
         )
         stamped(result.avatar, consent=self.consent).save(target)
         print_seconds(result.report)

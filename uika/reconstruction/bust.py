@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 
 
 @torch.no_grad()
-def with_bust(avatar: Avatar, head: HeadModel, fits: Sequence[Fit], photos: Sequence[Photo], report: Report) -> Avatar:
-    """The avatar of a head with a bust below it.
+def with_bust(
+    avatar: Avatar, head: HeadModel, fits: Sequence[Fit], photos: Sequence[Photo], report: Report
+) -> tuple[Avatar, HeadParameters]:
+    """The avatar of a head with a bust below it, and the poses [N] of both in the photos.
 
     Args:
         avatar: made for `head.without_bust`.
@@ -34,19 +36,18 @@ def with_bust(avatar: Avatar, head: HeadModel, fits: Sequence[Fit], photos: Sequ
     with report.stage("bust"):
         crops = [photo.bust for photo in photos if photo.bust is not None]
         mattes, inside = (torch.stack([getattr(crop, name) for crop in crops]) for name in ("matte", "inside"))
-        parameters = HeadParameters(
-            **{f.name: torch.cat([getattr(fit.parameters, f.name) for fit in fits]) for f in fields(HeadParameters)}
-        )
+        parameters = joined_parameters(fits)
         cameras = Camera.stack(
             [wider_camera(camera, photo) for camera, photo in zip(_single(fits), photos, strict=True)]
         )
         found = fit_torso(head, parameters, fits[0].static_offset, cameras, mattes, inside)
-        vertices = pose_vertices(head, torso_parameters(head, parameters, found.turns), found.offset)
+        poses = torso_parameters(head, parameters, found.turns)
+        vertices = pose_vertices(head, poses, found.offset)
         views = [BustView(vertices[n], cameras[n], crop.image, crop.matte) for n, crop in enumerate(crops)]
         neck = Binding(0, avatar.triangle, avatar.triangle, avatar.barycentric), avatar.colors
         bust = bust_splats(head, avatar.identity, found.offset, views, neck)
 
-    return replace(
+    result = replace(
         avatar,
         head_id=head.id,
         bust_triangle=None if head.bust is None else head.bust.face,
@@ -58,6 +59,14 @@ def with_bust(avatar: Avatar, head: HeadModel, fits: Sequence[Fit], photos: Sequ
         colors=torch.cat((avatar.colors, bust.colors)),
         triangle=torch.cat((avatar.triangle, bust.binding.triangle)),
         barycentric=torch.cat((avatar.barycentric, bust.binding.barycentric)),
+    )
+    return result, poses
+
+
+def joined_parameters(fits: Sequence[Fit]) -> HeadParameters:
+    """The parameters [N] of the photos of several fits."""
+    return HeadParameters(
+        **{f.name: torch.cat([getattr(fit.parameters, f.name) for fit in fits]) for f in fields(HeadParameters)}
     )
 
 

@@ -36,6 +36,7 @@ class FittedPhotos(NamedTuple):
     images: Tensor  # [N,3,S,S] on one plain colour
     mattes: Tensor  # [N,S,S] in [0,1]
     digests: list[str]  # of the files
+    hairs: Tensor  # [N,S,S] mattes of head and hair, in [0,1]
 
 
 def fit_files(
@@ -124,7 +125,8 @@ def fit_prepared(
     if loaded is not None and loaded.released is not None:
         pairs = [released_view(photo) for photo in photos]
     images, mattes = (torch.stack(parts) for parts in zip(*pairs, strict=True))
-    return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos])
+    hairs = torch.stack([each.hair for each in ordered])
+    return FittedPhotos(tuple(photos), fit, images, mattes, [photo.sha256 for photo in photos], hairs)
 
 
 def released_view(photo: Photo) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_prepared, prepare_files
 from uika.reconstruction.models import check_loaded, load_model
+from uika.reconstruction.outside import with_outside
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble, with_doubts
 from uika.reconstruction.report import Report
 
@@ -36,6 +37,7 @@ class GrowingAvatar:
         *,
         estimator: str | Path | None = None,
         backbone: str | Path | None = None,
+        photo_splats: bool = True,
     ) -> None:
         """Arguments as in `uika.reconstruct`.
 
@@ -46,6 +48,7 @@ class GrowingAvatar:
         self._head = load_head() if head is None else head
         check_loaded(self._loaded, self._head, estimator)
         self._keep: Keep = keep
+        self._photo_splats = photo_splats
         self._photos: list[PreparedPhoto] = []
         self._first: tuple[Fit | None, CanonicalHead] | None = None
         self._groups: list[FittedPhotos] = []  # photos that came in one step
@@ -101,8 +104,12 @@ class GrowingAvatar:
         photos = [photo for group in groups for photo in group.photos]
         digests = sorted(photo.sha256 for photo in photos)
         avatar = assemble(self._loaded, alone, canonical, gaussians, digests)
+        fits, head, poses = [group.fit for group in groups if group.fit], alone, None
         if self._loaded.takes_bust(self._head):
-            avatar = with_bust(avatar, self._head, [group.fit for group in groups if group.fit], photos, report)
+            head = self._head
+            avatar, poses = with_bust(avatar, head, fits, photos, report)
+        if self._photo_splats and not self._loaded.on_template:
+            avatar = with_outside(avatar, head, groups, report, poses)
         self._photos = [*self._photos, *new] if before else list(new)
         self._first, self._groups = (fit, canonical), groups
         return with_doubts(avatar, photos)

@@ -18,6 +18,7 @@ from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
 from uika.reconstruction.models import LoadedModel, check_loaded, load_model
+from uika.reconstruction.outside import with_outside
 from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def reconstruct(
     backbone: str | Path | None = None,
     refine: bool = True,
     keep: Keep = "all",
+    photo_splats: bool = True,
     report: Report | None = None,
 ) -> Reconstruction:
     """Make an avatar from photos of one person.
@@ -63,6 +65,8 @@ def reconstruct(
         backbone: DINOv3 weights for released weights without their own.
         refine: whether to refine the fit with the colours that two or more photos share.
         keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
+        photo_splats: whether to add splats for what the photos show outside the fitted surface; a model whose Gaussians
+            start on the mean head gets none.
         report: filled while the stages pass; None makes a new one.
 
     Raises:
@@ -82,8 +86,11 @@ def reconstruct(
     avatar = avatar_from_fit(
         loaded, alone, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
     )
+    poses = None
     if bust and observed.fit is not None:
-        avatar = with_bust(avatar, head, [observed.fit], observed.photos, report)
+        avatar, poses = with_bust(avatar, head, [observed.fit], observed.photos, report)
+    if photo_splats and not loaded.on_template:
+        avatar = with_outside(avatar, head if bust else alone, [observed], report, poses)
     return Reconstruction(with_doubts(avatar, observed.photos), observed.photos, observed.fit, report)
 
 
