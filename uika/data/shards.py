@@ -96,7 +96,7 @@ def read_shard(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
 
 
 def shard_samples(path: str | Path, strict: bool = False) -> Iterator[Sample]:
-    """The samples of a shard that `uika.data.synthesis` wrote; bad ones are left out unless `strict`.
+    """The samples of a shard that `uika.data.synthesize` wrote; bad ones are left out unless `strict`.
 
     Raises:
         DataError: the shard is damaged, or, with `strict`, one of its samples.
