@@ -160,3 +160,9 @@ def test_the_bust_covers_the_person_in_the_photo(head: HeadModel) -> None:
     rows = torch.arange(len(alpha)) < low
     shown, covered = photo.bust.matte[rows] > 0.5, alpha[rows] > 0.5
     assert float((shown & covered).sum() / (shown | covered).sum()) > 0.93
+    # The collar beside the jaw lies where the shoulders do, not before the cheek.
+    count = int(result.avatar.provenance["photo_splats"])
+    added = torch.arange(len(result.avatar)) >= len(result.avatar) - count
+    clothes = result.avatar.means[added & result.avatar.on_bust]
+    face = result.avatar.canonical_vertices(whole)[whole.masks["face"] > 0.5]
+    assert len(clothes) > 500 and torch.cdist(clothes, face).min() > 0.03

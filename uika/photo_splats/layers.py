@@ -73,6 +73,15 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
     solid = shown.alpha > SOLID
     away, nearest = distance_transform_edt(~solid.numpy(), return_indices=True)
     row, column = torch.from_numpy(nearest).long()
+    hair = view.matte - view.hair < CLOTH
+    away = torch.from_numpy(away).float()
+    if head.bust is not None and bool((worn := solid & (triangle >= head.bust.face)).any()):
+        # A collar beside the jaw lies where the shoulders do, not where the jaw does.
+        far, below = distance_transform_edt(~worn.numpy(), return_indices=True)
+        row, column = (
+            torch.where(hair | solid, a, torch.from_numpy(b)) for a, b in zip((row, column), below, strict=True)
+        )
+        away = torch.where(hair | solid, away, torch.from_numpy(far).float())
     within = torch.from_numpy(distance_transform_edt(functional.pad(solid, (1, 1, 1, 1)).numpy()))[1:-1, 1:-1]
     mean = _box(torch.where(solid, shown.depth, 0.0)) / _box(solid.float()).clamp_min(1e-6)
 
@@ -80,7 +89,6 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
     skin = functional.max_pool2d(face[None, None], 2 * SKIN_REACH + 1, 1, SKIN_REACH)[0, 0] > 0.5
     wanted = view.matte if clothes else view.hair
     lacking = ((wanted - shown.alpha) / (1 - shown.alpha).clamp_min(1e-3)).clamp(0, 1)
-    hair = view.matte - view.hair < CLOTH
     # What the matte adds at the face's own outline is background light or an error of the fit.
     outside = (shown.alpha < THIN) & (lacking > LEAST) & ~(skin[row, column] & (hair | solid))
     rim = solid & (within <= RIM) & (wanted > 0.5) & ~skin & hair
@@ -96,7 +104,7 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
         coverage=torch.where(rim, wanted, torch.where(outside, lacking, 0.0)),
         color=color,
         depth=mean[row, column],
-        distance=torch.from_numpy(away).float(),
+        distance=away,
         triangle=triangle,
     )
 
