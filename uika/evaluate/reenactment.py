@@ -117,7 +117,7 @@ def make_avatar(
     if correspondence == "exact":
         loaded = loaded._replace(estimator=None)
     observed = observe_sources(sources, correspondence, size, head, cutouts, loaded)
-    return avatar_from_fit(loaded, head, *observed, Report())
+    return avatar_from_fit(loaded, head, *observed, Report(), photo_splats=False)
 
 
 def drive(avatar: Avatar, targets: Sequence[View], head: HeadModel, background: float) -> list[Tensor]:

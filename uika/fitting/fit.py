@@ -38,6 +38,7 @@ class Fit:
     neutral head, which has no bust yet.
     error [N]: mean landmark distance in outer eye-corner distances. gain: of the refinement by colours, if it ran.
     landmarks [N,478,2]: as detected, crop pixels, where they are known.
+    head_mattes [N,S,S]: of head and hair, where they were given.
     """
 
     parameters: HeadParameters
@@ -46,6 +47,7 @@ class Fit:
     error: Tensor
     gain: Gain | None = None
     landmarks: Tensor | None = None
+    head_mattes: Tensor | None = None
 
 
 def fit_photos(
@@ -102,6 +104,8 @@ def fit_photos(
         identity=found.identity.float().expand(N, -1).contiguous(), expression=found.expression.float()
     )
     offset = teeth_offset(head) if known is None else known.static_offset
-    if head_mattes is not None and known is None:
-        offset = offset + fit_hair(head, parameters, cameras, torch.stack(list(head_mattes)))
-    return Fit(parameters, cameras, offset, found.error.float(), gain, torch.stack([p.landmarks for p in photos]))
+    mattes = None if head_mattes is None else torch.stack(list(head_mattes))
+    if mattes is not None and known is None:
+        offset = offset + fit_hair(head, parameters, cameras, mattes)
+    marks = torch.stack([photo.landmarks for photo in photos])
+    return Fit(parameters, cameras, offset, found.error.float(), gain, marks, mattes)

@@ -29,12 +29,18 @@ def with_outside(
         report: gets the time and the count.
         poses: [N] of head and bust in the photos; None takes those of the fits.
     """
+    fitted = [(group, group.fit) for group in groups if group.fit is not None]
+    poses = joined_parameters([fit for _, fit in fitted]) if poses is None else poses
+    cameras = [fit.cameras[n] for group, fit in fitted for n in range(len(group.photos))]
+    shown = [each for group, _ in fitted for each in zip(group.images, group.mattes, group.hairs, strict=True)]
+    return with_views(
+        avatar, head, [PhotoView(poses[n], camera, *shown[n]) for n, camera in enumerate(cameras)], report
+    )
+
+
+def with_views(avatar: Avatar, head: HeadModel, views: Sequence[PhotoView], report: Report) -> Avatar:
+    """The same for views whose poses, pictures and mattes are at hand."""
     with report.stage("photo splats"):
-        fitted = [(group, group.fit) for group in groups if group.fit is not None]
-        poses = joined_parameters([fit for _, fit in fitted]) if poses is None else poses
-        cameras = [fit.cameras[n] for group, fit in fitted for n in range(len(group.photos))]
-        shown = [each for group, _ in fitted for each in zip(group.images, group.mattes, group.hairs, strict=True)]
-        views = [PhotoView(poses[n], camera, *shown[n]) for n, camera in enumerate(cameras)]
         result = with_photo_splats(avatar, head, views)
     count = len(result) - len(avatar)
     report.counts["photo_splats"] = count

@@ -14,11 +14,12 @@ from uika._version import __version__
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
+from uika.photo_splats import PhotoView
 from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
 from uika.reconstruction.models import LoadedModel, check_loaded, load_model
-from uika.reconstruction.outside import with_outside
+from uika.reconstruction.outside import with_outside, with_views
 from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
@@ -83,9 +84,8 @@ def reconstruct(
         check_loaded(loaded, head, estimator)
     alone, bust = head.without_bust, loaded.takes_bust(head)
     observed = fit_files(photos, alone, refine=refine, report=report, loaded=loaded, bust=bust)
-    avatar = avatar_from_fit(
-        loaded, alone, observed.fit, observed.images, observed.mattes, observed.digests, report, keep
-    )
+    given = observed.fit, observed.images, observed.mattes, observed.digests
+    avatar = avatar_from_fit(loaded, alone, *given, report, keep, photo_splats=False)
     poses = None
     if bust and observed.fit is not None:
         avatar, poses = with_bust(avatar, head, [observed.fit], observed.photos, report)
@@ -113,6 +113,8 @@ def avatar_from_fit(
     digests: Sequence[str],
     report: Report,
     keep: Keep = "all",
+    *,
+    photo_splats: bool = True,
 ) -> Avatar:
     """Make an avatar from photos whose head and cameras are known.
 
@@ -125,11 +127,19 @@ def avatar_from_fit(
         digests: what identifies the photos, for the avatar's provenance.
         report: gets times and counts.
         keep: as in `reconstruct`.
+        photo_splats: whether to add splats for what the photos show outside the fitted surface, where the fit has the
+            mattes of head and hair.
     """
     head = head.without_bust
     canonical = CanonicalHead(loaded, head, fit, keep)
     gaussians = canonical.add(fit, images, mattes, report)
-    return assemble(loaded, head, canonical, gaussians, digests)
+    avatar = assemble(loaded, head, canonical, gaussians, digests)
+    if not photo_splats or loaded.on_template or fit is None or fit.head_mattes is None:
+        return avatar
+    shown = zip(images, mattes, fit.head_mattes, strict=True)
+    return with_views(
+        avatar, head, [PhotoView(fit.parameters[n], fit.cameras[n], *s) for n, s in enumerate(shown)], report
+    )
 
 
 def assemble(
