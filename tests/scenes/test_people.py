@@ -21,7 +21,7 @@ CAMERA = look_at(20, 5, 0.9, (0.0, -0.01, -0.03), size=96)
 
 @pytest.fixture(scope="module")
 def face() -> HeadModel:
-    return load_head()
+    return load_head().without_bust
 
 
 def test_a_person_is_painted_the_same_way_each_time(face: HeadModel) -> None:

@@ -30,33 +30,33 @@ class Animate:
     avatar: Positional[Path]
     """The avatar file."""
     motion: str = "talk"
-    """orbit, talk, expressions, or a motion: .npz, ARKit .csv or .json, FLAME parameters (file or folder)."""
+    """orbit, talk, expressions, or a motion file."""
     video: Path | None = None
-    """A video to be driven by, instead of a motion."""
+    """A video to be driven by instead."""
     speech: str | None = None
-    """A text to speak, or a recording (.wav, .mp3, ...) to be driven by and heard, instead of a motion."""
+    """A text to speak, or a recording."""
     transcript: Path | None = None
-    """A text file with the words of the recording; the lips follow them closer."""
+    """The recording's words in a text file."""
     language: str | None = None
-    """Language of the text for espeak-ng, such as de; else guessed from its letters."""
+    """Of the text, such as de; else guessed."""
     motion_head: Path | None = None
-    """The FLAME head that FLAME parameters belong to."""
+    """The head of FLAME parameters."""
     save_motion: Path | None = None
-    """A file to write the motion to as well: .npz, .csv (Live Link), .json (ARKit), .bvh, or flame_param.npz."""
+    """Write the motion to a file, too."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
     """The video to write."""
     size: int = 512
     """Side of the picture in pixels, even."""
     light: str | None = None
-    """"studio" or a Radiance picture (.hdr) of the surroundings to be lit by; it stays fixed to the head."""
+    """studio, or surroundings (.hdr) to be lit by."""
     light_from: Path | None = None
     """A photo of a face to be lit like."""
     fps: float | None = None
-    """Frames per second; else 25, or the motion's own."""
+    """Else 25, or the motion's own."""
     frame: Literal["bust", "head"] = "bust"
-    """What is framed: the portrait with its shoulders, or the head alone."""
+    """Portrait with shoulders, or head."""
     watermark: bool = True
-    """Mark the frames invisibly as rendered; `uika verify` finds it."""
+    """Invisible; `uika verify` finds it."""
 
     def run(self) -> int:
         """Render and encode."""
