@@ -9,7 +9,7 @@ RUN apt-get update \
 WORKDIR /app
 COPY . .
 RUN if [ -n "$CPU_INDEX" ]; then pip install --no-cache-dir -c constraints.txt --index-url "$CPU_INDEX" torch; fi \
- && pip install --no-cache-dir -c constraints.txt '.[cli,photo]'
+ && pip install --no-cache-dir -c constraints.txt ./drjit_splat '.[cli,photo]'
 ENV OMP_WAIT_POLICY=passive
 VOLUME /out
 ENTRYPOINT ["uika"]

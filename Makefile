@@ -13,12 +13,12 @@ export OMP_WAIT_POLICY ?= passive
 
 setup: $(READY) llvm
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml drjit_splat/pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "Python 3.10 to 3.14 is needed; set PYTHON=/path/to/python"; exit 1; }
 	@echo "installing into $(VENV): some minutes, about 3 GB"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'  # knows dependency groups
-	$(INSTALL) -e '.[all]'
+	$(INSTALL) -e ./drjit_splat -e '.[all]'
 	@touch $@
 
 .PHONY: llvm
@@ -73,7 +73,7 @@ docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 bake: setup
-	$(INSTALL) -e '.[all,bake]'
+	$(INSTALL) -e ./drjit_splat -e '.[all,bake]'
 	$(BIN)/python tools/bake_head.py
 
 clean:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ._version import __version__
+
 if TYPE_CHECKING:
     from . import reference
     from ._harmonics import sh_colors
@@ -39,6 +41,7 @@ __all__ = [
     "Prepared",
     "ProjectedFrame",
     "SplatFile",
+    "__version__",
     "load_ply",
     "load_spz",
     "prepare",

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ._version import __version__
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -194,6 +196,7 @@ def _parser() -> argparse.ArgumentParser:
 
     about = f"Render and train 3D Gaussian splats with Dr.Jit. {_EXAMPLE}"
     parser = argparse.ArgumentParser("drjit-splat", description=about)
+    parser.add_argument("--version", action="version", version=f"drjit-splat {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     render = commands.add_parser("render", help="render a splat .ply or .spz file", description=_EXAMPLE)
     render.add_argument("scene", help="a 3DGS .ply or .spz file with harmonics of degree 0 to 3")

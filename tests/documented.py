@@ -11,7 +11,10 @@ from uika.cli.commands import Command
 from uika.cli.head import ImportHead, ShowHead
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "drjit_splat/README.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+)
 _PROGRAMS = ("uika", "drjit-splat", "python", "torchrun", "make", "pip", "mkdocs")
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 

@@ -14,7 +14,7 @@ from tests.spoken import SENTENCE, spoken, write_wav
 from uika.assets import PORTRAIT
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", ROOT / "drjit_splat" / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 BLOCKS = [
     pytest.param(block, id=f"{page.stem}-{number}")
     for page in PAGES

@@ -50,7 +50,8 @@ def test_command_exists(command: str) -> None:
         assert all(re.search(rf"^{re.escape(target)}:", makefile, re.MULTILINE) for target in rest)
     elif program == "pip":
         extras: list[str] = re.findall(r"\[([\w,]+)\]", command)
-        project = (ROOT / "pyproject.toml").read_text()
+        folder = ROOT / "drjit_splat" if "drjit-splat[" in command else ROOT
+        project = (folder / "pyproject.toml").read_text()
         assert all(f"\n{name} = [" in project for found in extras for name in found.split(","))
     elif "-m" in rest:  # python, torchrun
         module = rest[rest.index("-m") + 1]

@@ -30,7 +30,7 @@ FEW = ("--identities", "2", "--views", "3", "--frames", "2", "--size", "128")
 class Installed:
     """The project's wheel with one extra in an environment of its own; `run` works in an empty folder."""
 
-    def __init__(self, wheel: Path, extra: str, place: Path) -> None:
+    def __init__(self, wheels: Path, extra: str, place: Path) -> None:
         self.folder, self._bin = place / "work", place / "venv" / ("Scripts" if os.name == "nt" else "bin")
         self.folder.mkdir()
         # Neither the checkout nor a variable of this process may lend a package.
@@ -38,9 +38,9 @@ class Installed:
             key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL"))
         }
         subprocess.run([sys.executable, "-m", "venv", str(place / "venv")], check=True)
-        wanted = f"uika-drjit[{extra}] @ {wheel.as_uri()}" if extra else str(wheel)
-        constraints = str(ROOT / "constraints.txt")
-        self.run("python", "-m", "pip", "install", "-q", "--disable-pip-version-check", "-c", constraints, wanted)
+        pip = ("python", "-m", "pip", "install", "-q", "--disable-pip-version-check", "--find-links", wheels)
+        wanted = extra if extra.startswith("drjit-splat") else f"uika-drjit[{extra}]" if extra else "uika-drjit"
+        self.run(*pip, "-c", ROOT / "constraints.txt", wanted)
 
     def command(self, *words: str | Path) -> list[str]:
         program, *rest = map(str, words)
@@ -55,11 +55,11 @@ class Installed:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("wheel")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("wheels")
     pip = [sys.executable, "-m", "pip", "wheel", "-q", "--disable-pip-version-check", "--no-deps"]
-    subprocess.run([*pip, "-w", str(place), str(ROOT)], check=True)
-    return next(place.glob("*.whl"))
+    subprocess.run([*pip, "-w", str(place), str(ROOT / "drjit_splat"), str(ROOT)], check=True)
+    return place
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +70,29 @@ def avatar(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def installed(request: pytest.FixtureRequest, wheel: Path, tmp_path: Path) -> Iterator[Installed]:
-    yield Installed(wheel, request.param, tmp_path)
+def installed(request: pytest.FixtureRequest, wheels: Path, tmp_path: Path) -> Iterator[Installed]:
+    yield Installed(wheels, request.param, tmp_path)
     shutil.rmtree(tmp_path)  # gigabytes
 
 
 def only(extra: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("installed", [extra], indirect=True, ids=[extra or "core"])
+
+
+@only("drjit-splat[train]")
+def test_the_splatting_alone_passes_its_tests(installed: Installed) -> None:
+    assert "drjit-splat " in installed.run("drjit-splat", "--version")
+    listed = installed.run("python", "-m", "pip", "list", "--format", "freeze", "--disable-pip-version-check").lower()
+    names = {line.partition("==")[0] for line in listed.splitlines()}
+    assert names >= {"drjit-splat", "torch", "pillow"} and not names & {"uika-drjit", "mitsuba", "viser", "scipy"}
+    tests = ("pytest", "hypothesis", "scipy")  # what the tests themselves need
+    installed.run("python", "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *tests)
+    own = shutil.ignore_patterns("test_examples.py", "__pycache__")  # the examples' portrait is uika's
+    shutil.copytree(ROOT / "tests" / "drjit_splat", installed.folder / "tests" / "drjit_splat", ignore=own)
+    for name in ("tests/__init__.py", "tests/recorded.py", "tests/conftest.py", "pyproject.toml"):
+        shutil.copy(ROOT / name, installed.folder / name)
+    said = installed.run("python", "-m", "pytest", "-q", "tests/drjit_splat")
+    assert " failed" not in said and " passed" in said, said
 
 
 @only("")

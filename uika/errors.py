@@ -31,5 +31,7 @@ class UikaWarning(UserWarning):
 
 def install_command(module: str) -> str | None:
     """The pip command that brings the package imported as `module`; None when no extra of this project does."""
+    if module.partition(".")[0] == "drjit_splat":
+        return "pip install drjit-splat, or in a checkout of this project: pip install ./drjit_splat"
     extra = EXTRAS.get(module.partition(".")[0])
     return None if extra is None else f'pip install "uika-drjit[{extra}]"'

@@ -14,6 +14,7 @@ from uika.errors import EXTRAS, install_command
 _CORE = ("torch", "drjit", "numpy", "safetensors")
 _MODULES = {
     "ai-edge-litert": "ai_edge_litert",
+    "drjit-splat": "drjit_splat",
     "opencv-python-headless": "cv2",
     "pillow": "PIL",
     "pillow-heif": "pillow_heif",
@@ -38,6 +39,7 @@ def examine() -> list[Finding]:
         Finding("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
     ]
     findings += [_package(module, 'pip install "uika-drjit"') for module in _CORE]
+    findings.append(_package("drjit_splat", install_command("drjit_splat") or ""))
     findings += [
         _package(module, install_command(module) or "", EXTRAS[module] in ("cli", "photo")) for module in EXTRAS
     ]
