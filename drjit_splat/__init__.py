@@ -11,11 +11,13 @@ if TYPE_CHECKING:
     from . import reference
     from ._harmonics import sh_colors
     from ._settings import Options
+    from .files import load_splats
     from .frames import Frame, ProjectedFrame, project_frame
     from .ply import SplatFile, load_ply, save_ply
     from .prepared import Prepared, prepare
     from .profiling import profile
     from .rasterizer import rasterization
+    from .splat import load_splat, save_splat
     from .spz import load_spz, save_spz
 
 _HOMES = {
@@ -25,12 +27,15 @@ _HOMES = {
     "ProjectedFrame": "frames",
     "SplatFile": "ply",
     "load_ply": "ply",
+    "load_splat": "splat",
+    "load_splats": "files",
     "load_spz": "spz",
     "prepare": "prepared",
     "profile": "profiling",
     "project_frame": "frames",
     "rasterization": "rasterizer",
     "save_ply": "ply",
+    "save_splat": "splat",
     "save_spz": "spz",
     "sh_colors": "_harmonics",
 }
@@ -43,6 +48,8 @@ __all__ = [
     "SplatFile",
     "__version__",
     "load_ply",
+    "load_splat",
+    "load_splats",
     "load_spz",
     "prepare",
     "profile",
@@ -50,6 +57,7 @@ __all__ = [
     "rasterization",
     "reference",
     "save_ply",
+    "save_splat",
     "save_spz",
     "sh_colors",
 ]

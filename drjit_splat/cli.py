@@ -152,9 +152,9 @@ def _render(arguments: argparse.Namespace) -> int:
         raise ModuleNotFoundError("writing pictures needs pillow; run: pip install pillow") from error
     import torch
 
-    from . import load_ply, load_spz, rasterization
+    from . import load_splats, rasterization
 
-    splats = (load_spz if Path(arguments.scene).suffix.lower() == ".spz" else load_ply)(arguments.scene)
+    splats = load_splats(arguments.scene)
     if not len(splats.means):
         raise ValueError(f"{arguments.scene} holds no splats")
     if arguments.camera:
@@ -198,8 +198,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("drjit-splat", description=about)
     parser.add_argument("--version", action="version", version=f"drjit-splat {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    render = commands.add_parser("render", help="render a splat .ply or .spz file", description=_EXAMPLE)
-    render.add_argument("scene", help="a 3DGS .ply or .spz file with harmonics of degree 0 to 3")
+    render = commands.add_parser("render", help="render a splat file", description=_EXAMPLE)
+    render.add_argument(
+        "scene", help="a .ply (plain or compressed), .spz or .splat file with harmonics of degree 0 to 3"
+    )
     render.add_argument("-o", "--output", default="out.png", help="the picture to write (default: %(default)s)")
     render.add_argument("--camera", help=_CAMERA_HELP)
     render.add_argument("--index", type=int, default=0, help="which camera of a list (default: %(default)s)")

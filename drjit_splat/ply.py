@@ -1,4 +1,4 @@
-"""Splat `.ply` files, the format that 3DGS viewers share."""
+"""Splat `.ply` files, the format that 3DGS viewers share, and PlayCanvas's compressed ones."""
 
 from __future__ import annotations
 
@@ -11,25 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ._compressed_ply import is_compressed, read_compressed
 from ._inputs import check_finite
+from ._ply_table import HEADER_LIMIT, Header, read_header, read_rows, vertices
 from .constants import SH_C0
 
-_HEADER_LIMIT = 1 << 16
 _REST = {0: 0, 9: 1, 24: 2, 45: 3}  # number of f_rest properties -> harmonic degree
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-}
-_KINDS = ("binary_little_endian", "binary_big_endian", "ascii")
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)))
 _QUAT = tuple(f"rot_{i}" for i in range(4))
 
@@ -55,81 +44,10 @@ class SplatFile:
         return 0.5 + SH_C0 * self.harmonics[:, 0]
 
 
-@dataclass(frozen=True)
-class Header:
-    """What the first lines of a `.ply` say of its vertices."""
-
-    count: int  # vertices
-    properties: list[tuple[str, str]]  # name and numpy type
-    kind: str  # one of _KINDS
-    length: int  # bytes before the first vertex
-
-
-def read_header(path: Path) -> Header:
-    """Read a file's first lines.
-
-    Raises:
-        ValueError: they are those of no `.ply` file that can be read; the message names it.
-    """
-    with path.open("rb") as file:
-        start = file.read(_HEADER_LIMIT)
-    marker = start.find(b"end_header")
-    end = start.find(b"\n", marker) + 1
-    if not start.startswith(b"ply") or marker < 0 or end == 0:
-        raise ValueError(f"{path} is not a .ply file (no header that starts with 'ply' and ends with 'end_header')")
-    lines = [line.split() for line in start[:marker].decode("ascii", "replace").splitlines()]
-    kind = next((line[1] for line in lines if line[:1] == ["format"] and line[2:] == ["1.0"]), "")
-    if kind not in _KINDS:
-        raise ValueError(f"{path} is of none of the formats {', '.join(_KINDS)}")
-    elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
-    first = lines[elements[0]] if elements else []
-    if first[1:2] != ["vertex"] or not first[-1].isdigit() or len(first[-1]) > 18:
-        if first[1:2] == ["chunk"] or any(line[-1:] == ["packed_position"] for line in lines):
-            raise ValueError(f"{path} is a compressed .ply; export it uncompressed")
-        raise ValueError(f"{path} must start with one 'element vertex <count>'")
-    properties = []
-    for line in lines[: elements[1] if len(elements) > 1 else None]:
-        if line[:1] == ["property"]:
-            if len(line) != 3 or line[1] not in _TYPES:
-                raise ValueError(f"{path} has a property that cannot be read: {' '.join(line)!r}")
-            properties.append((line[2], _TYPES[line[1]]))
-    if len({name for name, _ in properties}) != len(properties):
-        raise ValueError(f"{path} names a property twice")
-    return Header(int(first[-1]), properties, kind, end)
-
-
-def read_rows(path: Path, header: Header) -> NDArray[np.void]:
-    """One record for each vertex.
-
-    Raises:
-        ValueError: the file is cut short or damaged; the message names it.
-    """
-    layout = np.dtype(header.properties)
-    if header.kind == "ascii":
-        return _read_text(path, header, layout)
-    expected, size = header.length + header.count * layout.itemsize, path.stat().st_size
-    if size < expected:
-        raise ValueError(f"{path} is cut short: {header.count} splats need {expected} bytes, the file has {size}")
-    stored = layout.newbyteorder(">") if header.kind == "binary_big_endian" else layout
-    return np.fromfile(path, stored, header.count, offset=header.length)
-
-
-def _read_text(path: Path, header: Header, layout: np.dtype[np.void]) -> NDArray[np.void]:
-    with path.open("rb") as file:
-        file.seek(header.length)
-        words = file.read().split()
-    needed = header.count * len(header.properties)
-    if len(words) < needed:
-        raise ValueError(f"{path} is cut short: {header.count} splats need {needed} numbers, the file has {len(words)}")
-    try:
-        values = np.array(words[:needed], dtype=np.float64).reshape(header.count, -1)
-    except ValueError as error:
-        raise ValueError(f"{path} has a word among its numbers ({error})") from None
-    return np.rec.fromarrays(list(values.T), dtype=layout)
-
-
 def load_ply(path: str | os.PathLike[str]) -> SplatFile:
-    """Read a splat file with harmonics of degree 0 to 3, binary or text; further properties and elements are ignored.
+    """Read a splat file with harmonics of degree 0 to 3.
+
+    It may be binary, text (further properties and elements are ignored), or compressed in PlayCanvas's chunks.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -137,36 +55,43 @@ def load_ply(path: str | os.PathLike[str]) -> SplatFile:
     """
     path = Path(path)
     header = read_header(path)
-    count, names = header.count, [name for name, _ in header.properties]
+    if is_compressed(header):
+        found = SplatFile(**{name: torch.from_numpy(value) for name, value in read_compressed(path, header).items()})
+    else:
+        found = _read_plain(path, header)
+    try:
+        check_finite(**vars(found))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return found
+
+
+def _read_plain(path: Path, header: Header) -> SplatFile:
+    element = vertices(path, header)
+    count, names = element.count, [name for name, _ in element.properties]
     missing = [name for name in (*_NEEDED, *_QUAT) if name not in names]
     if missing:
         raise ValueError(f"{path} has no property {missing[0]!r}; is it a splat file?")
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise ValueError(f"{path} has {rest} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45")
-    table = read_rows(path, header)
+    table = read_rows(path, header, 1)[0]
 
     def columns(*chosen: str) -> Tensor:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in chosen], -1))
 
-    means = columns("x", "y", "z")
     harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     if rest:
         # The file keeps all coefficients of red, then of green, then of blue.
         higher = columns(*(f"f_rest_{i}" for i in range(rest))).view(count, 3, rest // 3)
         harmonics = torch.cat([harmonics, higher.transpose(1, 2)], 1)
-    found = SplatFile(
-        means,
+    return SplatFile(
+        columns("x", "y", "z"),
         columns(*_QUAT),
         columns("scale_0", "scale_1", "scale_2").exp(),
         columns("opacity")[:, 0].sigmoid(),
         harmonics.contiguous(),
     )
-    try:
-        check_finite(**vars(found))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return found
 
 
 def save_ply(
@@ -228,8 +153,8 @@ def save_ply(
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {_printable(line)}" for line in comments)]
     header += [f"element vertex {n}", *(f"property float {name}" for name in names), "end_header", ""]
     text = "\n".join(header).encode("ascii")
-    if len(text) > _HEADER_LIMIT:
-        raise ValueError(f"comments: the header would have {len(text)} bytes, more than {_HEADER_LIMIT}")
+    if len(text) > HEADER_LIMIT:
+        raise ValueError(f"comments: the header would have {len(text)} bytes, more than {HEADER_LIMIT}")
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:

@@ -146,10 +146,10 @@ def _integrator_class(mi: Any) -> Any:
 def _load(path: str) -> tuple[dict[str, tuple[int, ...]], dict[str, Tensor]]:
     """Shapes and values of a file's splats."""
     kind = Path(path).suffix.lower()
-    if kind in (".ply", ".spz"):
-        from drjit_splat import load_ply, load_spz
+    if kind in (".ply", ".splat", ".spz"):
+        from drjit_splat import load_splats
 
-        values = dict(vars((load_ply if kind == ".ply" else load_spz)(path)))
+        values = dict(vars(load_splats(path)))
     else:
         from uika.avatar import Avatar
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..ply import read_header, read_rows
+from .._ply_table import read_header, read_rows, vertices
 from .captures import Capture, Photo, rigid
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
@@ -119,7 +119,8 @@ def _point_cloud(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
     if not path.is_file():
         raise ValueError(f"{path}: the data set names this file of points, which is not there")
     header = read_header(path)
-    table = read_rows(path, header)
+    vertices(path, header)
+    table = read_rows(path, header, 1)[0]
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"{path}: has no properties x, y, z")

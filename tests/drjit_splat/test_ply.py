@@ -89,7 +89,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
             load_ply(path)
     # A header that promises more than the file holds must not allocate it.
     path.write_bytes(whole.replace(b"element vertex 40", b"element vertex " + b"9" * 5000))
-    with pytest.raises(ValueError, match=r"a\.ply must start with"):
+    with pytest.raises(ValueError, match=r"a\.ply has an element without"):
         load_ply(path)
     path.write_bytes(whole.replace(b"element vertex 40", b"element vertex 4000000000000"))
     with pytest.raises(ValueError, match="cut short"):
@@ -136,13 +136,3 @@ def test_wrong_tensors_are_named(tmp_path: Path) -> None:
         save_ply(tmp_path / "a.ply", **(splats() | {"quats": torch.zeros(40, 3)}))
     with pytest.raises(ValueError, match=r"^colors must have 1, 4, 9 or 16"):
         save_ply(tmp_path / "a.ply", **splats(harmonics=5))
-
-
-@pytest.mark.parametrize("first", ["chunk 2", "vertex 256", "sh 256"])
-def test_compressed_files_are_called_so(first: str, tmp_path: Path) -> None:
-    packed = ["property uint packed_position", "property uint packed_rotation"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element {first}", "property float min_x"]
-    lines += ["element vertex 256", *packed, "end_header", ""]
-    (tmp_path / "c.ply").write_bytes("\n".join(lines).encode() + bytes(9000))
-    with pytest.raises(ValueError, match=r"c\.ply (is a compressed \.ply|has no property)"):
-        load_ply(tmp_path / "c.ply")
