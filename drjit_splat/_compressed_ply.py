@@ -1,4 +1,4 @@
-"""Compressed splat `.ply` files of PlayCanvas and SuperSplat: 16 bytes a splat, in chunks of 256 with bounds of their own.
+"""Compressed splat `.ply` files of PlayCanvas and SuperSplat: 16 bytes a splat, chunks of 256 with own bounds.
 
 The layout is that of splat-transform's `decompress-ply.ts` (https://github.com/playcanvas/splat-transform).
 """
@@ -55,7 +55,7 @@ def read_compressed(path: Path, header: Header) -> Arrays:
         colors = triple("", "rgb", rgb) if "min_r" in (chunks.dtype.names or ()) else np.stack(rgb, -1)
     harmonics = ((colors - 0.5) / np.float32(SH_C0))[:, None]
     if rest:
-        stored = np.stack([rest[0][f"f_rest_{i}"] for i in range(len(rest[0].dtype))], -1)
+        stored = np.stack([rest[0][f"f_rest_{i}"] for i in range(len(rest[0].dtype.names or ()))], -1)
         share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored.astype(np.float32) + 0.5) / 256))
         higher = ((share - 0.5) * _SH_RANGE).reshape(count, 3, -1).transpose(0, 2, 1)
         harmonics = np.concatenate((harmonics, higher), 1)
@@ -103,7 +103,7 @@ def _shares(words: NDArray[np.uint32], bits: tuple[int, ...]) -> list[NDArray[np
 
 
 def _quats(words: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Quaternions [N,4] (wxyz) from two bits that name the largest component and ten for each of the others, in order."""
+    """Quaternions [N,4] (wxyz) from two bits that name the largest component and ten for each other one."""
     words = words.astype(np.uint32)
     small = (np.stack(_shares(words, (10, 10, 10)), -1) - np.float32(0.5)) * np.float32(np.sqrt(2.0))
     largest = (words >> np.uint32(30)).astype(np.int64)[:, None]

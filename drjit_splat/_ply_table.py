@@ -123,13 +123,13 @@ def _read_text(path: Path, header: Header, layouts: list[np.dtype[np.void]]) -> 
     with path.open("rb") as file:
         file.seek(header.length)
         words = file.read().split()
-    found, at = [], 0
+    found: list[NDArray[np.void]] = []
+    at = 0
     for element, layout in zip(header.elements, layouts, strict=False):
         needed = element.count * len(element.properties)
         if len(words) - at < needed:
-            raise ValueError(
-                f"{path} is cut short: {element.count} {element.name} need {needed} numbers, the file has {len(words) - at}"
-            )
+            has = f"the file has {len(words) - at}"
+            raise ValueError(f"{path} is cut short: {element.count} {element.name} need {needed} numbers, {has}")
         try:
             values = np.array(words[at : at + needed], dtype=np.float64).reshape(element.count, len(element.properties))
         except ValueError as error:
