@@ -39,6 +39,27 @@ def test_linked_files_exist(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name} links {target}"
 
 
+PAPER = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+STATEMENTS = [line for line in PAPER.splitlines() if line.startswith("| ") and not line.startswith("| statement")]
+
+
+@pytest.mark.parametrize("row", STATEMENTS, ids=lambda row: row[2:].split(" |")[0])
+def test_statements_of_the_paper_are_held_by_something(row: str) -> None:
+    held = re.findall(r"`([\w/]+\.py)::(\w+)`", row.rstrip(" |").rsplit(" | ", 1)[-1])
+    assert held, f"no test or code is named in: {row}"
+    for path, name in held:
+        code = (ROOT / path).read_text(encoding="utf-8")
+        assert re.search(rf"^\s*(def|class) {name}\b", code, re.MULTILINE), f"{path} has no {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_named_tests_exist(page: Path) -> None:
+    text = re.sub(r"gsplat 1\.5\.3's.*?\n\n", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target, name in re.findall(r"`((?:tests|uika|drjit_splat|scenes|benchmarks)/[\w/.]+\.py)(?:::(\w+))?`", text):
+        assert (ROOT / target).is_file(), f"{page.name} names {target}"
+        assert not name or re.search(rf"\b{name}\b", (ROOT / target).read_text(encoding="utf-8")), f"{target}::{name}"
+
+
 def test_the_site_shows_every_page_once_in_four_groups() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     navigation = text[text.index("\nnav:") :]

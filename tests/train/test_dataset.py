@@ -1,11 +1,14 @@
 """Items: exact and fitted correspondence, crops, augmentation."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from tests.stress.targets import captures
 from tests.train.common import CONFIG, SIZE, PaintedPeople, PaintedPerson
+from uika.data.datasets import Stored
 from uika.data.views import View
 from uika.head import load_head, look_at, pose_vertices, project
 from uika.head.alignment import aligned_camera
@@ -80,3 +83,15 @@ def test_degraded_pictures_stay_pictures():
         assert result.shape == image.shape and float(result.min()) >= 0 and float(result.max()) <= 1
         changed += not torch.allclose(result, image, atol=0.02)
     assert changed > 6
+
+
+def test_folders_are_trained_on_together(tmp_path: Path) -> None:
+    """The ablations of the data are lists of folders."""
+    people = {"studio": ("anna", "ben"), "videos": ("cleo",)}
+    for folder, names in people.items():
+        for name in names:
+            (tmp_path / folder / name).mkdir(parents=True)
+            captures(tmp_path / folder / name)
+    studio, both = Stored([tmp_path / "studio"]), Stored([tmp_path / "studio", tmp_path / "videos"])
+    assert (len(studio), len(both)) == (2, 3)
+    assert len(both[2]) == len(studio[0]) == 2
