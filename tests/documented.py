@@ -21,9 +21,18 @@ _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 def shown(page: Path) -> list[str]:
     """The commands in a page's blocks, without comments; continued lines are joined."""
-    blocks = (text for language, text in _BLOCK.findall(page.read_text(encoding="utf-8")) if language in ("", "bash"))
+    return _commands(page, ("", "bash"))
+
+
+def scripted(page: Path) -> list[str]:
+    """The commands in a page's scripts, which need files that no test folder has, or each other's."""
+    return _commands(page, ("sh",))
+
+
+def _commands(page: Path, languages: tuple[str, ...]) -> list[str]:
+    blocks = (text for language, text in _BLOCK.findall(page.read_text(encoding="utf-8")) if language in languages)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    found = (re.split(r"\s#\s", line)[0].strip() for line in lines)
+    found = (re.split(r"\s#\s", line)[0].strip().removeprefix("srun ") for line in lines)
     return [line for line in found if line.split(" ")[0] in _PROGRAMS]
 
 

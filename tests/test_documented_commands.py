@@ -18,9 +18,12 @@ from pathlib import Path
 import pytest
 
 import drjit_splat.cli
-from tests.documented import PAGES, ROOT, examples, mentioned, shown
+from tests.documented import PAGES, ROOT, examples, mentioned, scripted, shown
 from tests.drjit_splat.training.made_up import write_colmap
+from tests.exports import write_export
 from tests.filmed import act
+from tests.flame_files import flame_arrays, write_obj, write_pickle
+from tests.released_heads import write_released
 from tests.spoken import SENTENCE, spoken, write_wav
 from uika import Avatar, HeadParameters, load_head, neutral_camera, reconstruct, render, write_video
 from uika.assets import PORTRAIT
@@ -29,7 +32,9 @@ from uika.export import posed_splats, write_ply
 from uika.safeguards import mark, picture_provenance
 
 SHOWN = list(dict.fromkeys(command for page in PAGES for command in shown(page)))
-ALL = list(dict.fromkeys([*SHOWN, *(command for page in PAGES for command in mentioned(page)), *examples()]))
+SCRIPTED = [command for page in PAGES for command in scripted(page)]
+TOLD = [command for page in PAGES for command in mentioned(page)]
+ALL = list(dict.fromkeys([*SHOWN, *SCRIPTED, *TOLD, *examples()]))
 # What takes minutes or does not end by itself is stopped after so many seconds.
 LONG = {"uika view": 20, "uika train": 60, "uika synthesize": 60, "uika evaluate": 60, "drjit-splat train": 20}
 RUN = [command for command in SHOWN if command.startswith(("uika ", "drjit-splat "))]
@@ -104,6 +109,41 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "cameras.json").write_text(json.dumps([view] * 4))
     write_colmap(place / "garden", binary=True)
     return place
+
+
+@pytest.fixture(scope="module")
+def flame_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What users of released weights have: FLAME's files (made up), weights (small, random), a photo, captures."""
+    place = tmp_path_factory.mktemp("released")
+    write_pickle(place / "flame2023.pkl", flame_arrays())
+    write_obj(place / "flame_w_mouth.obj", flame_arrays())
+    shutil.copy(PORTRAIT, place / "photo.jpg")
+    write_released(place)
+    write_export(place / "captures" / "306_EMO-1_v16", cameras=3)
+    shutil.copytree(place / "captures" / "306_EMO-1_v16" / "flame_param", place / "flame_param")
+    return place
+
+
+@pytest.mark.slow
+def test_script_for_released_weights_runs(flame_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(flame_folder)
+    commands = scripted(ROOT / "docs" / "network.md")
+    assert len(commands) == 5
+    for command in commands:
+        assert main(shlex.split(command)[1:]) == 0, command
+
+
+def test_scripts_without_their_files_say_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command in SCRIPTED:
+        words = shlex.split(command)
+        words = words[words.index("uika") + 1 :] if "uika" in words else []
+        words = [word.replace("/data/", "") for word in words]
+        if words[:1] in (["train"], ["evaluate"], ["reconstruct"], ["animate"]):
+            assert main(words) == 2, command
+            assert "Traceback" not in (said := capsys.readouterr().err) and len(said.strip().splitlines()) <= 3, said
 
 
 def _long(command: str) -> bool:

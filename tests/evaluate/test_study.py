@@ -49,6 +49,14 @@ def test_the_page_does_not_tell_the_methods(clips: Path, tmp_path: Path) -> None
     assert again.read_text() != text
 
 
+def test_the_evaluation_offers_it(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--study", str(clips), "-o", str(tmp_path / "a")]) == 0
+    assert main(["study", str(clips), "-o", str(tmp_path / "b")]) == 0
+    assert (tmp_path / "a" / PAGE).read_bytes() == (tmp_path / "b" / PAGE).read_bytes()
+    assert main(["evaluate", "-o", str(tmp_path / "c")]) == 2
+    assert "--study" in capsys.readouterr().err
+
+
 def test_the_table_is_the_mean_of_the_answers(clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = tmp_path / "study"
     assert main(["study", str(clips), "-o", str(study)]) == 0

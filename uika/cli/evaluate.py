@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+from uika.cli.study import Study
 from uika.errors import UikaError
 
 
@@ -18,7 +19,7 @@ class Evaluate:
     Run it again to go on. Example: uika evaluate --data people -o report
     """
 
-    data: Path
+    data: Annotated[Path | None, arg(metavar="PATH")] = None
     """A folder with captures or shards."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("report")
     """The report's folder, which gathers all runs."""
@@ -44,15 +45,21 @@ class Evaluate:
     """Grey level behind the person, 0 to 1."""
     targets: int = 8
     """Target frames of each sequence, at most."""
-    lpips: Path | None = None
+    lpips: Annotated[Path | None, arg(metavar="PATH")] = None
     """LPIPS weights (.safetensors)."""
-    arcface: Path | None = None
+    arcface: Annotated[Path | None, arg(metavar="PATH")] = None
     """An ArcFace network (.onnx) for CSIM."""
-    external: Path | None = None
+    external: Annotated[Path | None, arg(metavar="PATH")] = None
     """Score another system's pictures in this folder, SEQUENCE/VIEWS/TARGET.png, instead of a model's."""
+    study: Annotated[Path | None, arg(metavar="PATH")] = None
+    """Clips to ask people about instead, see uika study."""
 
     def run(self) -> int:
         """Evaluate, write the report and print the table."""
+        if self.study is not None:
+            return Study(self.study, output=self.output).run()
+        if self.data is None:
+            raise UikaError("give the data with --data, or clips to ask people about with --study")
         counts = _counts(self.views)
         from uika.evaluate import Evaluation, evaluate_all, gather, write_report
         from uika.evaluate.report import markdown_table
