@@ -56,6 +56,43 @@ def blind(data: bytes, rng: random.Random) -> bytes:
     return bytes(out)
 
 
+_BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"meta", b"iprp", b"ipco", b"iinf", b"dinf", b"edts", b"udta")
+
+
+def boxes(data: bytes, rng: random.Random) -> bytes:
+    """Edit the content, the size or the name of one box of an MP4 or HEIC file, take it away, double or empty it."""
+    if rng.random() < 0.3:
+        return blind(data, rng)
+    found: list[tuple[int, int]] = []
+    waiting = [(0, len(data))]
+    while waiting:
+        at, end = waiting.pop()
+        while at + 8 <= end:
+            size, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+            if size < 8 or at + size > end:
+                break
+            found.append((at, at + size))
+            if name in _BOXES:
+                waiting.append((at + (12 if name in (b"meta", b"iinf") else 8), at + size))
+            at += size
+    if not found:
+        return blind(data, rng)
+    start, stop = rng.choice(found)
+    box, kind = data[start:stop], rng.randrange(6)
+    if kind < 2 and len(box) > 8:
+        changed = blind(box[8:], rng)[: len(box) - 8].ljust(len(box) - 8, b"\0")
+        box = box[:8] + changed
+    elif kind == 2:
+        box = (rng.choice(NUMBERS) % 2**32).to_bytes(4, "big") + box[4:]
+    elif kind == 3:
+        box = box[:4] + rng.choice((b"free", b"moov", b"mdat", b"\0\0\0\0", rng.randbytes(4))) + box[8:]
+    elif kind == 4:
+        box = rng.choice((b"", box * 2))
+    else:
+        box = (8).to_bytes(4, "big") + box[4:8]
+    return data[:start] + box + data[stop:]
+
+
 def text(data: bytes, rng: random.Random) -> bytes:
     """Replace a token of a text by an awkward one, or damage it blindly."""
     tokens = list(re.finditer(rb"[\w.+-]+|\"[^\"]*\"|[\[\]{},:]", data))

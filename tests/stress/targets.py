@@ -40,7 +40,7 @@ from uika.motion import (
 from uika.photo import PhotoError
 from uika.photo.read import read
 
-from . import more_targets, mutate, recordings
+from . import more_targets, mutate, outside_targets, recordings
 
 
 @dataclass(frozen=True)
@@ -230,4 +230,6 @@ TARGETS = {
     "motion_json": Target(_poses, mutate.text, read_json, MotionError),
     "transforms": Target(captures, mutate.text, _read_capture, DataError),
     "shard": Target(_shards, mutate.tar, _read_shard, DataError),
-} | {name: Target(*parts) for name, parts in (more_targets.TARGETS | recordings.TARGETS).items()}
+}
+for more in (more_targets.TARGETS, recordings.TARGETS, outside_targets.TARGETS):
+    TARGETS |= {name: Target(*parts) for name, parts in more.items()}

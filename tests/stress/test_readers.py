@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import importlib
 import json
+import pickle
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from drjit_splat.cli import load_camera
 from uika.errors import UikaError
 from uika.export import glb_provenance, html_provenance, read_glb
+from uika.head import HeadError
+from uika.head_import import from_flame
+from uika.head_import.flame_file import read_flame
+from uika.io.radiance_hdr import read_hdr
 from uika.io.video import write_video
 from uika.model import CheckpointError, load_checkpoint
+from uika.motion import MotionError, read_bvh
 from uika.safeguards import verify
 from uika.tracking.decode import decode, frame_rate
 
@@ -131,3 +138,47 @@ def test_many_large_frames_are_not_kept(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(importlib.import_module("uika.safeguards.verification"), "_PIXELS_KEPT", 4 * 96 * 128)
     found = verify(tmp_path / "a.mp4")
     assert found.watermark is not None and found.watermark.frames <= 4
+
+
+def test_a_torch_file_with_a_damaged_directory(tmp_path: Path) -> None:
+    torch.save({"v_template": torch.zeros(3)}, tmp_path / "a.pt")
+    data = (tmp_path / "a.pt").read_bytes()
+    place = data.rindex(b"PK\x01\x02")
+    (tmp_path / "a.pt").write_bytes(data[: place + 46] + b"\x97" + data[place + 47 :])
+    with pytest.raises(HeadError, match=r"a\.pt: "):
+        read_flame(tmp_path / "a.pt")
+
+
+def test_torch_files_of_old_are_called_that(tmp_path: Path) -> None:
+    torch.save({"v_template": torch.zeros(3)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(HeadError, match=r"a\.pt: is a PyTorch file"):
+        read_flame(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("mask", [np.zeros(0, np.int64), np.array(2), np.array([[0, 1]])])
+def test_masks_of_odd_shapes(mask: np.ndarray, tmp_path: Path) -> None:
+    (tmp_path / "m.pkl").write_bytes(pickle.dumps({"scalp": mask, "face": np.array([3])}, 2))
+    masks = from_flame._read_masks(tmp_path / "m.pkl", 5)
+    assert masks["scalp"].sum() == mask.size and masks["face"].tolist() == [0, 0, 0, 1, 0]
+
+
+def test_masks_that_are_no_vertex_numbers(tmp_path: Path) -> None:
+    (tmp_path / "m.pkl").write_bytes(pickle.dumps({"face": np.array([np.nan, 1.0])}))
+    with pytest.raises(HeadError, match=r"m\.pkl: mask 'face' is no list of vertex numbers"):
+        from_flame._read_masks(tmp_path / "m.pkl", 5)
+
+
+def test_a_skeleton_that_would_be_read_forever(tmp_path: Path) -> None:
+    (tmp_path / "a.bvh").write_text(
+        "HIERARCHY ROOT Head { CHANNELS -2 Xrotation }\nMOTION\nFrames: 1\nFrame Time: 1\n0"
+    )
+    with pytest.raises(MotionError, match=r"a\.bvh: a joint has -2 channels"):
+        read_bvh(tmp_path / "a.bvh")
+
+
+@pytest.mark.parametrize("size", [(16384, 16384), (8192, 16384), (400, 400)])
+def test_light_that_promises_more_than_it_holds(size: tuple[int, int], tmp_path: Path) -> None:
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % size
+    (tmp_path / "a.hdr").write_bytes(head + bytes([2, 2, size[1] >> 8, size[1] & 255]) * 20)
+    with pytest.raises(UikaError, match=r"a\.hdr: "):
+        read_hdr(tmp_path / "a.hdr")

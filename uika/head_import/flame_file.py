@@ -20,6 +20,8 @@ from uika.io.npz import ArraysError, read_npy, read_npz
 VERTICES = 5023
 IDENTITIES, EXPRESSIONS = 300, 100
 EYELIDS = ("eyelidLeft", "eyelidRight")
+_TORCH = "{}: is a PyTorch file; give the .pkl that FLAME comes as, or an .npz"
+_OLD_TORCH = bytes.fromhex("80028a0a6cfc9c46f9206aa850192e")  # how files begin that PyTorch before 1.6 wrote
 _SHAPES: dict[str, tuple[int, ...]] = {
     "v_template": (VERTICES, 3),
     "shapedirs": (VERTICES, 3, IDENTITIES + EXPRESSIONS),
@@ -97,9 +99,7 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
             return read_npz(source)
         except ArraysError as error:
             if _is_torch(source):
-                raise HeadError(
-                    f"{source}: is a PyTorch file; give the .pkl that FLAME comes as, or an .npz"
-                ) from error
+                raise HeadError(_TORCH.format(source)) from error
             raise HeadError(f"{source}: cannot be read as an .npz of plain arrays: {error}") from error
     if source.suffix == ".npz":
         raise HeadError(f"{source}: is damaged or no .npz file; fetch it again")
@@ -108,12 +108,18 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
     try:
         return read_arrays(source)
     except UnpickleError as error:
+        with source.open("rb") as file:
+            if file.read(len(_OLD_TORCH)) == _OLD_TORCH:
+                raise HeadError(_TORCH.format(source)) from error
         raise HeadError(str(error)) from error
 
 
 def _is_torch(source: Path) -> bool:
-    with zipfile.ZipFile(source) as archive:
-        return any(name.endswith(("/data.pkl", "/constants.pkl")) for name in archive.namelist())
+    try:
+        with zipfile.ZipFile(source) as archive:
+            return any(name.endswith(("/data.pkl", "/constants.pkl")) for name in archive.namelist())
+    except Exception:  # a damaged directory can fail in any way
+        return False
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:

@@ -97,9 +97,11 @@ def _read_masks(path: Path, vertices: int) -> Mapping[str, Tensor]:
         raise HeadError(str(error)) from error
     result = {}
     for name, parts in _FLAME_MASKS.items():
-        if found := [torch.from_numpy(lists[part].astype("int64")) for part in parts if part in lists]:
-            index = torch.cat(found)
-            if int(index.max()) >= vertices or int(index.min()) < 0:
+        if found := [lists[part] for part in parts if part in lists]:
+            if any(part.dtype.kind not in "iu" for part in found):
+                raise HeadError(f"{path}: mask '{name}' is no list of vertex numbers")
+            index = torch.cat([torch.from_numpy(part.astype("int64").reshape(-1)) for part in found])
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < vertices:
                 raise HeadError(f"{path}: mask '{name}' points outside the {vertices} vertices")
             result[name] = torch.zeros(vertices).index_fill(0, index, 1.0)
     if not result:

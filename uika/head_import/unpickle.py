@@ -117,6 +117,12 @@ def _encode(text: Any, encoding: Any) -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes(*arguments: Any) -> bytes:
+    if arguments:
+        raise UnpickleError("makes bytes in another way than they are stored")
+    return b""
+
+
 def _globals() -> dict[tuple[str, str], Callable[..., Any]]:
     known: dict[tuple[str, str], Callable[..., Any]] = {("_codecs", "encode"): _Call(_encode)}
     for core in ("numpy.core", "numpy._core"):
@@ -128,6 +134,7 @@ def _globals() -> dict[tuple[str, str], Callable[..., Any]]:
         known[module, "_reconstructor"] = _Call(_make)
     for module in ("__builtin__", "builtins"):
         known[module, "object"] = _Object
+        known[module, "bytes"] = _Call(_no_bytes)  # how Python 3 stores an empty array for Python 2
         known[module, "set"] = known[module, "frozenset"] = _Container
     known["collections", "OrderedDict"] = known["collections", "defaultdict"] = _Container
     for module in ("chumpy", "chumpy.ch"):

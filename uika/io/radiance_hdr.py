@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from uika.errors import UikaError
 
 _MAX_SIDE = 16384
+_MAX_PIXELS = 1 << 27  # 16384 x 8192
+_MOST_PACKED = 64  # times that run lengths make a row smaller
 
 
 def read_hdr(path: str | Path) -> NDArray[np.float32]:
@@ -29,13 +31,17 @@ def read_hdr(path: str | Path) -> NDArray[np.float32]:
     height, width = int(head[1]), int(head[2])
     if not (0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE):
         raise UikaError(f"{source}: is {width}x{height} pixels; sides of 1 to {_MAX_SIDE} can be read")
+    if height * width > _MAX_PIXELS:
+        raise UikaError(f"{source}: is {width}x{height} pixels; {_MAX_PIXELS >> 20} million are the most")
     body = np.frombuffer(data, np.uint8, offset=head.end())
     try:
+        if height * width * 4 > _MOST_PACKED * len(body):
+            raise ValueError("size")
         rows = _coded(body, height, width) if body[:2].tolist() == [2, 2] else body[: height * width * 4]
         pixels = rows.reshape(height, width, 4)
     except (IndexError, ValueError) as error:
         raise UikaError(f"{source}: is cut short or damaged; fetch it again") from error
-    scale = np.ldexp(1.0, pixels[..., 3:].astype(np.int32) - 136) * (pixels[..., 3:] > 0)
+    scale = np.ldexp(np.float32(1), pixels[..., 3:].astype(np.int16) - 136) * (pixels[..., 3:] > 0)
     return np.asarray(pixels[..., :3] * scale, dtype=np.float32)
 
 

@@ -135,6 +135,8 @@ def _joints(words: list[str]) -> tuple[list[_Joint], int]:
             at += 1
         elif word == "CHANNELS":
             count = int(words[at + 1])
+            if count < 0:
+                raise MotionError(f"a joint has {count} channels")
             for number, channel in enumerate(words[at + 2 : at + 2 + count]):
                 if channel[1:] == "rotation" and channel[0] in "XYZ":
                     joints[open_[-1]].turns.append((column + number, channel[0]))
