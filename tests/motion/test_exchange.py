@@ -138,7 +138,7 @@ def test_flame_parameters_need_a_flame_head(head: HeadModel, tmp_path: Path) -> 
         ("a.json", "{", "JSON"),
         ("a.json", "[]", "one pose"),
         ("a.json", '{"frames": [{"smirk": 1}]}', "names no ARKit actions"),
-        ("a.json", '{"jawOpen": "wide"}', "could not convert"),
+        ("a.json", '{"jawOpen": "wide"}', "no number but 'wide'"),
         ("a.json", '{"jawOpen": NaN}', "not finite"),
         ("a.txt", "", "is no motion"),
         ("a.npz", "", "plain arrays"),

@@ -22,6 +22,8 @@ IDENTITIES, EXPRESSIONS = 300, 100
 EYELIDS = ("eyelidLeft", "eyelidRight")
 _TORCH = "{}: is a PyTorch file; give the .pkl that FLAME comes as, or an .npz"
 _OLD_TORCH = bytes.fromhex("80028a0a6cfc9c46f9206aa850192e")  # how files begin that PyTorch before 1.6 wrote
+_ROUNDING = 1e-3  # below 0 that weights may be
+_HEIGHTS = (0.05, 2.0)  # metres of a mean head; files in millimetres or centimetres lie far outside
 _SHAPES: dict[str, tuple[int, ...]] = {
     "v_template": (VERTICES, 3),
     "shapedirs": (VERTICES, 3, IDENTITIES + EXPRESSIONS),
@@ -52,8 +54,14 @@ def read_flame(path: str | Path, obj: str | Path | None = None, eyelids: Sequenc
         lids = [_read_offset(Path(lid)) for lid in eyelids]
         if len(lids) not in (0, 2):
             raise HeadError(f"eyelids: give two files, left and right, not {len(lids)}")
+        return _assembled(arrays, faces, uvs, uv_faces, lids)
     except HeadError as error:
         raise HeadError(f"{source}: {error}") from error
+
+
+def _assembled(
+    arrays: Mapping[str, np.ndarray], faces: Tensor, uvs: Tensor, uv_faces: Tensor, lids: list[Tensor]
+) -> HeadModel:
     template = _real(arrays["v_template"])
     shapes = _real(arrays["shapedirs"]).permute(2, 0, 1).contiguous()
     expression = torch.cat((shapes[IDENTITIES:], *(lid[None] for lid in lids)))
@@ -100,6 +108,8 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
         except ArraysError as error:
             if _is_torch(source):
                 raise HeadError(_TORCH.format(source)) from error
+            if packed := next((name for name in _names(source) if name.lower().endswith(".pkl")), None):
+                raise HeadError(f"{source}: is an archive; unpack it and give '{packed}' of it") from error
             raise HeadError(f"{source}: cannot be read as an .npz of plain arrays: {error}") from error
     if source.suffix == ".npz":
         raise HeadError(f"{source}: is damaged or no .npz file; fetch it again")
@@ -115,11 +125,16 @@ def _read(source: Path) -> Mapping[str, np.ndarray]:
 
 
 def _is_torch(source: Path) -> bool:
+    return any(name.endswith(("/data.pkl", "/constants.pkl")) for name in _names(source))
+
+
+def _names(source: Path) -> list[str]:
+    """What lies in an archive; nothing where that cannot be read."""
     try:
         with zipfile.ZipFile(source) as archive:
-            return any(name.endswith(("/data.pkl", "/constants.pkl")) for name in archive.namelist())
+            return archive.namelist()
     except Exception:  # a damaged directory can fail in any way
-        return False
+        return []
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:
@@ -131,8 +146,18 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             raise HeadError(f"array '{name}' has shape {found} where FLAME has {shape}")
         if not np.issubdtype(arrays[name].dtype, np.number) or not np.isfinite(arrays[name]).all():
             raise HeadError(f"array '{name}' does not hold finite numbers")
+    if arrays["weights"].min() < -_ROUNDING or arrays["weights"].sum(-1).min() <= 0:
+        raise HeadError("array 'weights' has a vertex that no joint moves, or one less than nothing")
+    height = float(np.ptp(arrays["v_template"], axis=0).max())
+    if not _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+        raise HeadError(f"has a mean head of {height:.3g} metres; FLAME's unit is the metre, scale v_template to it")
     if "kintree_table" in arrays:
-        parents = arrays["kintree_table"].reshape(-1, len(JOINT_PARENTS))[0].astype(np.uint32).astype(np.int32)
+        table = arrays["kintree_table"]
+        if table.ndim != 2 or table.shape[1] != len(JOINT_PARENTS):
+            raise HeadError(f"array 'kintree_table' has shape {table.shape} where FLAME has (2, {len(JOINT_PARENTS)})")
+        if table.dtype.kind not in "iu":
+            raise HeadError("array 'kintree_table' does not hold whole numbers")
+        parents = table[0].astype(np.uint32).astype(np.int32)
         if tuple(parents[1:].tolist()) != JOINT_PARENTS[1:]:
             raise HeadError(f"array 'kintree_table' has the parents {parents.tolist()}, FLAME has {JOINT_PARENTS}")
 
@@ -140,9 +165,15 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
 def _own_uvs(arrays: Mapping[str, np.ndarray]) -> tuple[Tensor, Tensor, Tensor]:
     if "vt" not in arrays or "ft" not in arrays or "f" not in arrays:
         raise HeadError("has no texture coordinates; give a Wavefront file of the mesh that has them with --obj")
+    vt = arrays["vt"]
+    if vt.ndim != 2 or vt.shape[1] < 2 or vt.dtype.kind not in "fiu":
+        raise HeadError(f"array 'vt' has shape {vt.shape} where texture coordinates [T,2] are needed")
+    for name in ("f", "ft"):
+        if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or arrays[name].dtype.kind not in "iu":
+            raise HeadError(f"array '{name}' is no table of triangles [F,3] by whole numbers")
     return (
         torch.from_numpy(arrays["f"].astype(np.int64)),
-        _real(arrays["vt"])[:, :2].contiguous(),
+        _real(vt)[:, :2].contiguous(),
         torch.from_numpy(arrays["ft"].astype(np.int64)),
     )
 

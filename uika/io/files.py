@@ -62,12 +62,19 @@ def stands_for_another(path: Path) -> str:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` with its extension; renamed to `path` at the end, removed after an error."""
+    """A temporary path beside `path` with its extension; renamed to `path` at the end, removed after an error.
+
+    Raises:
+        UikaError: nothing can be written there.
+    """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
+    except OSError as error:
+        raise UikaError(f"{target}: cannot be written ({error.strerror}); choose another place") from error
+    try:
         mode = temporary.stat().st_mode & 0o777
         yield temporary
         temporary.chmod(mode)  # some writers make private files of their own

@@ -61,7 +61,9 @@ def read_sound(path: str | Path) -> Sound:
                 if count > MAX_SECONDS * RATE:
                     raise _too_long(source)
             parts += [part.to_ndarray()[0] for part in resampler.resample(None)]
-    except (av.FFmpegError, OSError) as error:
+    except UikaError:
+        raise
+    except (av.FFmpegError, OSError, ValueError) as error:
         raise UikaError(f"{source}: cannot be read as sound ({error})") from error
     samples = np.concatenate(parts) if parts else np.zeros(0, np.float32)
     if not len(samples):

@@ -20,4 +20,7 @@ def read_text(path: Path) -> str:
         raise ValueError(f"more than {MAX_BYTES >> 20} MiB")
     data = path.read_bytes()
     encoding = next((name for mark, name in _MARKS.items() if data.startswith(mark)), "utf-8")
-    return data.decode(encoding)
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"no UTF-8 text, from byte {error.start} on; save it as UTF-8") from error

@@ -24,7 +24,10 @@ def upright(picture: NDArray[np.uint8], frame: Any) -> NDArray[np.uint8]:
 
     Only quarter turns are made; a player would show other angles with empty corners, which no camera writes.
     """
-    matrix = frame.side_data.get("DISPLAYMATRIX")
+    try:
+        matrix = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:  # among what the frame brings is something newer than PyAV
+        return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90)))
     if matrix is None or matrix.buffer_size < 36:
         return picture
     a, b, _, c, d = struct.unpack("<5i", bytes(matrix)[:20])

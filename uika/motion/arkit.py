@@ -18,7 +18,7 @@ from uika.io.files import check_output, replacing
 from uika.motion.action_names import HEAD_ANGLES
 from uika.motion.arkit_json import parse
 from uika.motion.motion import Motion, MotionError
-from uika.motion.recording import Recording, axis_angles, from_file, to_angles
+from uika.motion.recording import Recording, axis_angles, from_file, read_number, to_angles
 
 _TIMECODE = re.compile(r"(\d{1,4}):(\d{1,4}):(\d{1,4})[:;.](\d{1,4}(?:\.\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120, 240)  # what the last part of a timecode counts, frames per second
@@ -50,6 +50,8 @@ def _table(text: str) -> Recording:
         raise MotionError(f"line {lines.line_num} is damaged ({error})") from error
     if not rows:
         raise MotionError("its first line names no ARKit actions such as EyeBlinkLeft; the file is empty")
+    if not rows[0][1][0].strip():  # tables of Python programs begin with a nameless column that counts the rows
+        rows = [(line, row[1:]) for line, row in rows]
     names = [cell.strip() for cell in rows[0][1]]
     while names and not names[-1]:  # spreadsheets end lines with a mark
         names.pop()
@@ -76,7 +78,7 @@ def _cells(names: list[str], plain: dict[str, int], cells: list[str], line: int)
         if name.lower() == "timecode":
             continue
         try:
-            values[name] = float(cell) if cell else None
+            values[name] = read_number(cell) if cell else None
         except ValueError:
             raise MotionError(f"line {line} is damaged: {name} is {cell[:40]!r}") from None
     faces = [value for name, value in values.items() if name.lower() not in (*_NUMBERED, "frame", "blendshapecount")]

@@ -27,12 +27,12 @@ def parse(text: str) -> Recording:
         MotionError: JSON of another kind.
     """
     try:
-        content = json.loads(text)
+        content = _loads(text)
     except json.JSONDecodeError:
         lines = [line for line in text.splitlines() if line.strip()]
         if len(lines) < 2:
             raise
-        content = [json.loads(line) for line in lines]
+        content = [_loads(line) for line in lines]
     names, frames, fps = _parts(content)
     if not isinstance(frames, list) or not frames:
         raise MotionError(_MEANING)
@@ -42,6 +42,19 @@ def parse(text: str) -> Recording:
     if any(isinstance(frame, dict) and frame.get("rotation") for frame in frames):
         warnings.warn("its head rotations, whose axes the format does not say, are not read", UikaWarning, stacklevel=2)
     return Recording(rows, [f"frame {index}" for index in range(len(rows))], _times(frames), fps)
+
+
+def _loads(text: str) -> Any:
+    return json.loads(text, object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON, whose names must differ: programs disagree about which of two counts."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(name for name, _ in pairs if sum(name == other for other, _ in pairs) > 1)
+        raise MotionError(f"names '{twice[:40]}' twice in one place; keep one")
+    return found
 
 
 def _parts(content: Any) -> tuple[list[str] | None, Any, float | None]:
@@ -57,10 +70,15 @@ def _parts(content: Any) -> tuple[list[str] | None, Any, float | None]:
     names = next((place[key] for place in (content, noted) for key in _NAMES if key in place), None)
     if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
         raise MotionError("its names are no list of words")
+    if names is not None and len(set(names)) < len(names):
+        raise MotionError(f"its names have '{max(names, key=names.count)[:40]}' twice; keep one")
     frames = next((content[key] for key in _ROWS if key in content), None)
     if frames is None:
         frames = _from_curves(content) or [content]
-    return names, frames, None if rate is None else float(rate)
+    try:
+        return names, frames, None if rate is None else float(rate)
+    except (ValueError, TypeError):
+        raise MotionError(f"its frame rate is no number but '{str(rate)[:40]}'") from None
 
 
 def _from_curves(content: dict[str, Any]) -> list[Any] | None:

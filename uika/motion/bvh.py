@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from uika.motion.motion import Motion, MotionError
 from uika.motion.recording import axis_angles, to_angles
 
 _HEADS = ("head", "skull")
+_ENDS = ("end", "top", "tip", "nub", "site")  # of what sits on a head
 _ORDER = "Yrotation Xrotation Zrotation"  # yaw, pitch, roll: each about the axes that the one before has turned
 _CENTIMETRES = 100.0  # units of the file in a metre, as motion capture programs have it
 _MOST_CELLS = 50_000_000
@@ -94,7 +96,7 @@ def _parsed(text: str) -> Motion:
     rows = np.array(cells) if {len(row) for row in cells} == {total} else np.zeros(0)
     if rows.shape != (count, total) or not np.isfinite(rows).all():
         raise MotionError(f"has rows that do not hold {total} finite numbers each")
-    found = next((k for k, joint in enumerate(joints) if _named(joint.name, _HEADS)), None)
+    found = next((k for k, joint in enumerate(joints) if _is_head(joint.name)), None)
     if found is None:
         raise MotionError("has no joint named as a head")
     world = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
@@ -127,9 +129,10 @@ def _joints(words: list[str]) -> tuple[list[_Joint], int]:
     while at < len(words):
         word = words[at]
         if word in ("ROOT", "JOINT"):
-            joints.append(_Joint(words[at + 1], open_[-1] if open_ else -1, []))
+            end = words.index("{", at)
+            joints.append(_Joint(" ".join(words[at + 1 : end]), open_[-1] if open_ else -1, []))
             open_.append(len(joints) - 1)
-            at += 1
+            at = end
         elif word == "End":
             open_.append(-1)
             at += 1
@@ -158,9 +161,10 @@ def _matrices(rows: NDArray[np.float64], turns: list[tuple[int, str]]) -> Tensor
     return result
 
 
-def _named(name: str, words: tuple[str, ...]) -> bool:
-    """Whether a joint's name, without what programs put before it, is one of the words."""
-    return name.lower().rpartition(":")[2].removeprefix("mixamorig").strip("_-. ") in words
+def _is_head(name: str) -> bool:
+    """Whether a joint's name says head, whatever programs put around it: mixamorig:Head, Bip01 Head, CC_Base_Head."""
+    words = re.split(r"[\s:_.|-]+", name.lower())
+    return any(word.removeprefix("mixamorig") in _HEADS for word in words) and not set(words) & set(_ENDS)
 
 
 def _degrees(turn: Tensor) -> NDArray[np.float64]:

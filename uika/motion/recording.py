@@ -80,8 +80,10 @@ def to_motion(recording: Recording) -> Motion:
     seen = [row for row in recording.rows if row]
     names = list(dict.fromkeys(name for row in seen for name in row))
     actions = find_actions(names)
-    columns = {action: [_number(row, name) for row in recording.rows] for name, action in actions.items()}
+    rows = list(zip(recording.rows, recording.labels, strict=True))
+    columns = {action: [_number(row, name, label) for row, label in rows] for name, action in actions.items()}
     _check(columns, recording.labels)
+    _check_angles(columns, recording.labels)
     values = np.zeros((len(recording.rows), len(ARKIT_ACTIONS) + len(HEAD_ANGLES)))
     for place, name in enumerate((*ARKIT_ACTIONS, *HEAD_ANGLES)):
         if name in columns:
@@ -98,18 +100,42 @@ def to_motion(recording: Recording) -> Motion:
     return Motion(expression=table[:, :count], fps=fps, **{**rest, "neck": from_angles(table[:, count:])})
 
 
-def _number(row: dict[str, Any] | None, name: str) -> float:
+def read_number(text: str) -> float:
+    """The number in a cell.
+
+    Raises:
+        ValueError: it is none; Python's own 1_000 is none to others.
+    """
+    if "_" in text:
+        raise ValueError(f"no number: {text!r}")
+    return float(text)
+
+
+def _number(row: dict[str, Any] | None, name: str, label: str) -> float:
     """The number, or NaN for a gap; what a row with a face does not mention rests."""
     if not row:
         return math.nan
     if (value := row.get(name, 0.0)) is None:
         return math.nan
-    if isinstance(value, (list, dict)):
-        raise MotionError(f"'{name}' is no number but a {'list' if isinstance(value, list) else 'group'}")
-    number = float(value)
+    kinds = {list: "a list", dict: "a group", bool: "true or false"}
+    if type(value) in kinds:
+        raise MotionError(f"'{name}' is no number but {kinds[type(value)]} in {label}")
+    try:
+        number = read_number(value) if isinstance(value, str) else float(value)
+    except ValueError:
+        raise MotionError(f"'{name}' is no number but '{value[:40]}' in {label}") from None
     if not math.isfinite(number):
-        raise MotionError(f"'{name}' holds a value that is not finite")
+        raise MotionError(f"'{name}' holds a value that is not finite in {label}")
     return number
+
+
+def _check_angles(columns: dict[str, list[float]], labels: list[str]) -> None:
+    """Refuse heads that turn further than half around: their angles are degrees."""
+    for name in HEAD_ANGLES:
+        wide = [place for place, value in enumerate(columns.get(name, ())) if abs(value) > math.pi]
+        if wide:
+            value = columns[name][wide[0]]
+            raise MotionError(f"{name} is {value:g} in {labels[wide[0]]}; angles are radians (degrees? divide by 57.3)")
 
 
 def _check(columns: dict[str, list[float]], labels: list[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from uika.photo.networks import face_boxes, face_meshes
 
 SCAN_SIDE = 640  # the detectors shrink their input to 192 or 128 px, so more would be lost
 LARGE_SIDE = 4 * SCAN_SIDE  # the smallest tiles need no more than this of the photo
+WIDE = 3.0  # long side over short side of a panorama, whose faces are small against its length
 MESH_SIDE = 512
 FACE_MARGIN = 2.0  # side of the crop given to the face mesh, in face sizes
 # Crops of the second pass: (scale, shift x, shift y) relative to the margin above. Their mean is steadier than any one.
@@ -24,17 +27,30 @@ def find_face(photo: NDArray[np.uint8]) -> NDArray[np.float64] | None:
     """Landmarks [478,2] (mediapipe face mesh order, photo pixels, centres at +0.5) of the largest face, or None.
 
     Looks at the whole photo first, then, when nothing is found, at the photo with a border (close-ups), then at
-    overlapping tiles of a half and a quarter of the photo (small faces). A detection counts when
+    overlapping tiles of a half and a quarter of the photo (small faces), then along a panorama. A detection counts when
     several crops of it agree.
     """
     shrink = max(1.0, max(photo.shape[:2]) / LARGE_SIDE)
     overview = _shrunk(photo, shrink)
-    for squares in _searches(*overview.shape[:2]):
-        for face in _faces(overview, squares, shrink):
+    rounds = [(overview, squares, shrink) for squares in _searches(*overview.shape[:2])]
+    low, high = sorted(photo.shape[:2])
+    if high > WIDE * low:
+        shrink = max(1.0, low / LARGE_SIDE)
+        strip = _shrunk(photo, shrink)
+        rounds.append((strip, _along(*strip.shape[:2]), shrink))
+    for picture, squares, scale in rounds:
+        for face in _faces(picture, squares, scale):
             landmarks = _refine(photo, face)
             if landmarks is not None:
                 return landmarks
     return None
+
+
+def _along(height: int, width: int) -> list[Square]:
+    """Overlapping squares as wide as a panorama's short side."""
+    low, high = sorted((height, width))
+    places = np.linspace(0, high - low, 2 * math.ceil(high / low))
+    return [(float(at), 0.0, float(low)) if width > height else (0.0, float(at), float(low)) for at in places]
 
 
 def _searches(height: int, width: int) -> list[list[Square]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import threading
 import warnings
 from dataclasses import dataclass
@@ -21,6 +22,22 @@ MAX_BYTES = 512 * 1024 * 1024
 MIN_SIDE = 64
 FORMATS = ("JPEG", "PNG", "WEBP")
 KINDS = "JPEG, PNG, WebP or HEIC"
+_OTHERS = [  # how files begin that are pictures, or should be, but of no kind that is read
+    (re.compile(start, re.IGNORECASE), name)
+    for start, name in (
+        (rb"GIF8", "a GIF, which has few colours"),
+        (rb"II\*\0|MM\0\*", "a TIFF or a camera's raw file"),
+        (rb"BM.{4}\0{4}", "a BMP file"),
+        (rb".{4}ftypavi[fs]", "an AVIF file"),
+        (rb"\xff\x0a|\0\0\0\x0cJXL ", "a JPEG XL file"),
+        (rb"%PDF", "a PDF"),
+        (rb"\s*(<\?xml[^>]*>\s*)?<svg", "a drawing (SVG)"),
+        (rb"\s*<(!doctype|html)", "a web page; download the photo itself"),
+        (rb"version https://git-lfs", "a Git LFS pointer; fetch the photo itself"),
+        (rb".{4}ftyp", "a film; take a still of it"),
+    )
+]
+_NO_HEIC = (b"avi", b"iso", b"mp4", b"qt", b"M4", b"avc", b"3g")  # brands of AVIF and of films
 _FILTERS = threading.Lock()  # the filters of warnings are the whole process's
 
 
@@ -58,19 +75,21 @@ def read(path: str | Path) -> Picture:
 
 
 def _read_bytes(path: Path) -> bytes:
-    if path.is_dir():
-        raise PhotoError(path, f"is a directory; give a {KINDS} file")
-    if not path.exists():
-        raise PhotoError(path, "does not exist; check the path")
-    if not path.is_file():
-        raise PhotoError(path, f"is not a regular file; give a {KINDS} file")
+    if path.parts[:1] in (("http:",), ("https:",)):
+        raise PhotoError(path, "is a web address; download the photo and give the file")
     try:
+        if path.is_dir():
+            raise PhotoError(path, f"is a directory; give a {KINDS} file")
+        if not path.exists():
+            raise PhotoError(path, "does not exist; check the path")
+        if not path.is_file():
+            raise PhotoError(path, f"is not a regular file; give a {KINDS} file")
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise PhotoError(path, f"takes {size >> 20} MiB, more than {MAX_BYTES >> 20} MiB; save a smaller copy")
         data = path.read_bytes()
     except OSError as error:
-        raise PhotoError(path, f"cannot be read ({error.strerror}); check its permissions") from error
+        raise PhotoError(path, f"cannot be read ({error.strerror}); check its name and permissions") from error
     if not data:
         raise PhotoError(path, "is empty; copy or download the photo again")
     return data
@@ -93,7 +112,9 @@ def _decode(path: str | Path, data: bytes) -> tuple[NDArray[np.uint8], NDArray[n
     except _NoHeifError as error:
         raise PhotoError(path, "looks like HEIC; install pillow-heif (pip install 'uika-drjit[photo]')") from error
     except UnidentifiedImageError as error:
-        raise PhotoError(path, f"is not a readable photo; save it as {KINDS}") from error
+        kind = next((name for start, name in _OTHERS if start.match(data)), "not a readable photo")
+        remedy = "" if ";" in kind else f"; save it as {KINDS}"
+        raise PhotoError(path, f"is {kind}{remedy}") from error
     except Exception as error:  # decoders meet hostile bytes with many exception types
         raise PhotoError(path, f"is damaged or cut short ({error}); copy or export it again") from error
 
@@ -113,7 +134,7 @@ def _open(data: bytes) -> Any:
     try:
         return Image.open(io.BytesIO(data), formats=FORMATS)
     except UnidentifiedImageError:
-        if data[4:8] != b"ftyp" or data[8:12] in (b"avif", b"avis"):
+        if data[4:8] != b"ftyp" or data[8:12].startswith(_NO_HEIC):
             raise
     try:
         from pillow_heif import HeifImageFile

@@ -138,6 +138,8 @@ def frame_rate(path: Path) -> float:
     try:
         with open_media(path) as container:
             rate = _moving(path, container).average_rate
-    except (av.FFmpegError, OSError, LookupError) as error:
+    except VideoError:
+        raise
+    except (av.FFmpegError, OSError, LookupError, ValueError) as error:
         raise VideoError(f"{path}: cannot be read as a video ({error})") from error
     return float(rate) if rate else DEFAULT_FPS
