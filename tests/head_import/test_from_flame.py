@@ -43,6 +43,7 @@ def test_nearest_point_on_a_mesh(builtin: HeadModel) -> None:
 
 @pytest.mark.slow
 def test_embedding_and_masks_of_the_built_in_head_are_found_again(builtin: HeadModel) -> None:
+    builtin = builtin.without_bust  # what is imported has none; a neck's mask would take the shoulders in
     bare = replace(builtin, masks={}, landmark_ids=builtin.landmark_ids[:0], landmark_faces=builtin.landmark_faces[:0],
                    landmark_barycentrics=builtin.landmark_barycentrics[:0],
                    landmark_weights=builtin.landmark_weights[:0])  # fmt: skip
@@ -54,7 +55,7 @@ def test_embedding_and_masks_of_the_built_in_head_are_found_again(builtin: HeadM
     for name in ("face", "lips", "ears", "scalp", "neck", "eyeballs"):
         a, b = found.masks[name] > 0.5, builtin.masks[name] > 0.5
         overlap = float((a & b).sum() / (a | b).sum())
-        assert overlap > (0.25 if name in ("lips", "ears", "neck") else 0.6), (name, overlap)
+        assert overlap > {"lips": 0.35, "ears": 0.5, "neck": 0.5}.get(name, 0.6), (name, overlap)
 
 
 @pytest.mark.slow

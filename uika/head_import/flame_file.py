@@ -155,11 +155,15 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         table = arrays["kintree_table"]
         if table.ndim != 2 or table.shape[1] != len(JOINT_PARENTS):
             raise HeadError(f"array 'kintree_table' has shape {table.shape} where FLAME has (2, {len(JOINT_PARENTS)})")
-        if table.dtype.kind not in "iu":
+        if not _whole(table):
             raise HeadError("array 'kintree_table' does not hold whole numbers")
         parents = table[0].astype(np.uint32).astype(np.int32)
         if tuple(parents[1:].tolist()) != JOINT_PARENTS[1:]:
             raise HeadError(f"array 'kintree_table' has the parents {parents.tolist()}, FLAME has {JOINT_PARENTS}")
+
+
+def _whole(array: np.ndarray) -> bool:
+    return array.dtype.kind in "iu" or (array.dtype.kind == "f" and bool((array == np.floor(array)).all()))
 
 
 def _own_uvs(arrays: Mapping[str, np.ndarray]) -> tuple[Tensor, Tensor, Tensor]:
@@ -169,7 +173,7 @@ def _own_uvs(arrays: Mapping[str, np.ndarray]) -> tuple[Tensor, Tensor, Tensor]:
     if vt.ndim != 2 or vt.shape[1] < 2 or vt.dtype.kind not in "fiu":
         raise HeadError(f"array 'vt' has shape {vt.shape} where texture coordinates [T,2] are needed")
     for name in ("f", "ft"):
-        if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or arrays[name].dtype.kind not in "iu":
+        if arrays[name].ndim != 2 or arrays[name].shape[1] != 3 or not _whole(arrays[name]):
             raise HeadError(f"array '{name}' is no table of triangles [F,3] by whole numbers")
     return (
         torch.from_numpy(arrays["f"].astype(np.int64)),

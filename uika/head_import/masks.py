@@ -22,8 +22,8 @@ EYES = (
     (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466),
 )
 CHIN, NOSE_BASE, BROWS = 152, 2, (105, 334)
-EAR_REACH = 0.045  # metres around the outermost vertex
-EAR_RELIEF = 0.0035  # metres that an ear stands out of the smoothed head
+EAR_REACH = 0.055  # metres around the outermost vertex
+EAR_RELIEF, EAR_ROUNDS = 0.003, 120  # metres that an ear stands out sideways of the head smoothed so often
 MOUTH_REACH = 0.06  # metres behind the lips
 LOOK_SIZE = 160  # pixels over that reach on both sides, 0.8 mm each
 VIEWS = tuple((yaw, pitch) for yaw in range(-180, 180, 30) for pitch in (-40, 0, 40))
@@ -105,15 +105,16 @@ def _ramp(at: Tensor, knots: tuple[float, ...], values: tuple[float | Tensor, ..
 
 def _ears(head: HeadModel, skin: Tensor) -> Tensor:
     points = head.template
-    relief = (points - _smooth(points, head.faces, 60)).norm(dim=-1)
+    # Sideways only: smoothing an ear draws the skull around it outwards just as far.
+    relief = points[:, 0] - _smooth(points, head.faces, EAR_ROUNDS)[:, 0]
     middle = head.joints[3:5].mean(0)
     height = points[:, 1] - middle[1]
-    level = skin & (height > -0.06) & (height < 0.03) & (points[:, 2] < middle[2] - 0.03)
+    level = skin & (height > -0.06) & (height < 0.04) & (points[:, 2] < middle[2] - 0.03)
     ears = torch.zeros(len(points), dtype=torch.bool)
     for side in (-1.0, 1.0):
         outward = torch.where(level, side * points[:, 0], -torch.inf)
         tip = points[int(outward.argmax())]
-        ears |= level & ((points - tip).norm(dim=-1) < EAR_REACH) & (relief > EAR_RELIEF)
+        ears |= level & ((points - tip).norm(dim=-1) < EAR_REACH) & (side * relief > EAR_RELIEF)
     return ears
 
 
