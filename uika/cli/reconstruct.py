@@ -30,6 +30,8 @@ class Reconstruct:
     """A correspondence estimator in the place of the fitted head or the model's own."""
     backbone: Path | None = None
     """DINOv3 weights for released weights without their own."""
+    correspondence: Literal["fit", "network", "both"] | None = None
+    """What tells pixels their place: the fitted head, an estimator, or a fit that an estimator helps."""
     refine: bool = True
     """Refine face shape and poses with the colours that two or more photos share."""
     keep: Literal["all", "foreground"] = "all"
@@ -46,12 +48,13 @@ class Reconstruct:
         from uika.reconstruction import check_model, reconstruct
         from uika.safeguards import stamped
 
-        check_model(self.model, self.estimator, self.backbone)
+        check_model(self.model, self.estimator, self.backbone, self.correspondence)
         result = reconstruct(
             self.photos,
             model=self.model,
             estimator=self.estimator,
             backbone=self.backbone,
+            correspondence=self.correspondence,
             refine=self.refine,
             keep=self.keep,
             photo_splats=self.photo_splats,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +12,7 @@ from uika.errors import UikaError
 from uika.io.files import check_folder
 
 OVERFIT_GOAL = 35.0  # dB
+_OF_CORRESPONDENCE = ("output", "part", "steps", "resume", "seed", "people", "learning_rate", "save_every")
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,8 @@ class Train:
     """Folders of people, or "synthetic" ones."""
     preset: Literal["tiny", "base", "paper"] = "tiny"
     """Size of the network, and its training."""
-    part: Literal["reconstructor", "estimator"] = "reconstructor"
-    """Which network."""
+    part: Literal["reconstructor", "estimator", "correspondence"] = "reconstructor"
+    """Which network; correspondence is the small estimator."""
     steps: int | None = None
     """Steps in all."""
     resume: bool = False
@@ -65,6 +66,8 @@ class Train:
     def run(self) -> int:
         """Train."""
         check_folder(self.output)
+        if self.part == "correspondence":
+            return self._train_correspondence()
         from uika.model.weight_kind import ESTIMATORS, check_kind
         from uika.train import MODEL_FILE, SYNTHETIC, TRAINING, Setup, Stored, Synthetic, join_group, leave_group, train
         from uika.train.logbook import read_log
@@ -123,4 +126,28 @@ class Train:
         if self.overfit and self.part == "reconstructor":
             psnr = read_log(self.output)[-1]["psnr"]
             print(f"overfit: {psnr:.1f} dB, {'reached' if psnr >= OVERFIT_GOAL else 'below'} {OVERFIT_GOAL:g} dB")
+        return 0
+
+    def _train_correspondence(self) -> int:
+        """Train the small correspondence estimator on people that are made before."""
+        for option in fields(self):
+            if option.name not in _OF_CORRESPONDENCE and getattr(self, option.name) != option.default:
+                raise UikaError(
+                    f"--{option.name.replace('_', '-')} has no meaning for --part correspondence; leave it out"
+                )
+        from tqdm import tqdm
+
+        from uika.data.surface_items import ItemSettings, make_items
+        from uika.head import load_head
+        from uika.train.surface_training import SurfaceTraining, train_surface
+
+        given = {name: getattr(self, name) for name in ("steps", "learning_rate", "save_every")}
+        config = replace(
+            SurfaceTraining(seed=self.seed, people=self.people),
+            **{name: value for name, value in given.items() if value is not None},
+        )
+        head, items = load_head(), self.output / "items"
+        with tqdm(total=self.people, desc="people", unit="person") as bar:
+            make_items(items, head, range(self.people), ItemSettings(), lambda _: bar.update())
+        print(f"wrote {train_surface(self.output, items, head, config, self.resume)}")
         return 0

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from uika.fitting.hair import fit_hair
 from uika.fitting.landmark_bias import unbiased
-from uika.fitting.landmarks import fit_landmarks
+from uika.fitting.landmarks import SurfaceMarks, fit_landmarks
 from uika.fitting.refinement import Gain, refine_landmark_fit
 from uika.fitting.teeth import teeth_offset
 from uika.head import Camera, HeadModel, HeadParameters
@@ -59,6 +59,7 @@ def fit_photos(
     focals: Sequence[float | None] | None = None,
     correct_detector: bool | None = None,
     known: Fit | None = None,
+    marks: SurfaceMarks | None = None,
 ) -> Fit:
     """Fit one identity to all photos and expression, camera and hair to each (float32).
 
@@ -72,6 +73,7 @@ def fit_photos(
             the contours that they were found at, but several views then agree on shape and distance. None does so
             where views have to agree: with two or more photos, or a known person.
         known: an earlier fit of the person, whose identity and hair are kept as they are.
+        marks: where the photos show other points of the surface, see `uika.fitting.SurfaceMarks`.
 
     Raises:
         ValueError: there is no photo, or the photos have different sizes.
@@ -88,9 +90,9 @@ def fit_photos(
         correct_detector = len(photos) > 1 or known is not None
     focal = torch.tensor([torch.nan if each is None else each for each in focals]) if focals is not None else None
     if correct_detector:
-        landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width, focal=focal), head)
+        landmarks = unbiased(landmarks, fit_landmarks(landmarks, head, width, focal=focal, marks=marks), head)
     identity = None if known is None else known.parameters.identity[0]
-    found, gain = fit_landmarks(landmarks, head, width, identity, focal), None
+    found, gain = fit_landmarks(landmarks, head, width, identity, focal, marks), None
     if images is not None and known is None:
         found, gain = refine_landmark_fit(found, images, landmarks, head)
     N = len(photos)
@@ -107,5 +109,5 @@ def fit_photos(
     mattes = None if head_mattes is None else torch.stack(list(head_mattes))
     if mattes is not None and known is None:
         offset = offset + fit_hair(head, parameters, cameras, mattes)
-    marks = torch.stack([photo.landmarks for photo in photos])
-    return Fit(parameters, cameras, offset, found.error.float(), gain, marks, mattes)
+    detected = torch.stack([photo.landmarks for photo in photos])
+    return Fit(parameters, cameras, offset, found.error.float(), gain, detected, mattes)

@@ -18,6 +18,8 @@ from uika.fitting.weights import (
     LANDMARK_FACING,
     LANDMARK_HIDDEN_TRUST,
     LANDMARK_NOISE,
+    MARK_ROBUST_SCALE,
+    MARK_SHARE,
     PHOTO_ROBUST_SCALE,
 )
 from uika.head import HeadModel, vertex_normals
@@ -53,8 +55,26 @@ class LandmarkFit:
 
 
 @dataclass(frozen=True)
+class SurfaceMarks:
+    """Where photos show D points of the head's surface, beside the landmarks of a detector.
+
+    triangle [D] and barycentric [D,3] of the points; place [N,D,2] crop pixels; weight [N,D] trust in [0,1], 0 where a
+    photo does not show the point.
+    """
+
+    triangle: Tensor
+    barycentric: Tensor
+    place: Tensor
+    weight: Tensor
+
+    def on(self, head: HeadModel, vertices: Tensor) -> Tensor:
+        """The points [...,D,3] on a head with vertices [...,V,3]."""
+        return (vertices[..., head.faces[self.triangle], :] * self.barycentric[..., None].to(vertices.dtype)).sum(-2)
+
+
+@dataclass(frozen=True)
 class _Problem:
-    points: Tensor  # [L,3] mean landmarks
+    points: Tensor  # [L,3] mean landmarks, surface marks behind them
     identity: Tensor  # [K,L,3]
     expression: Tensor  # [E,L,3]
     target: Tensor  # [N,L,2] pixels relative to the principal point
@@ -66,10 +86,17 @@ class _Problem:
     lens: Tensor  # [N] pixels, the noted focal length; NaN where there is none
     identity_prior: float
     known: bool  # whether the identity stays as it is
+    scale: Tensor  # [L] of robust errors
+    landmarks: int  # how many of the points a detector found
 
 
 def fit_landmarks(
-    landmarks: Tensor, head: HeadModel, size: int, identity: Tensor | None = None, focal: Tensor | None = None
+    landmarks: Tensor,
+    head: HeadModel,
+    size: int,
+    identity: Tensor | None = None,
+    focal: Tensor | None = None,
+    marks: SurfaceMarks | None = None,
 ) -> LandmarkFit:
     """Fit the head to N photos.
 
@@ -79,6 +106,7 @@ def fit_landmarks(
         size: side of the crops; the principal point is taken at the centre.
         identity: [K] of a person known from before; None fits it too.
         focal: [N] pixels that the cameras noted, NaN where one did not; None if none did.
+        marks: more points of the surface whose places are known.
 
     Raises:
         ValueError: the landmarks have another shape or are not finite, or a focal length is not positive.
@@ -108,9 +136,13 @@ def fit_landmarks(
         lens=torch.full((N,), torch.nan, dtype=torch.float64) if focal is None else focal.double(),
         identity_prior=IDENTITY_PRIOR[0],
         known=identity is not None,
+        scale=torch.full((len(ids),), PHOTO_ROBUST_SCALE, dtype=torch.float64),
+        landmarks=len(ids),
     )
     rotation, translation, pixels, unit = _weak_perspective(problem, eye_distance(exact))
     problem = replace(problem, pixel_unit=unit)
+    if marks is not None:
+        problem = _with_marks(problem, exact, marks, size)
     state = LandmarkFit(
         torch.zeros(K, dtype=torch.float64) if identity is None else identity.double(),
         torch.zeros(N, E, dtype=torch.float64),
@@ -122,8 +154,26 @@ def fit_landmarks(
     for prior, steps in zip(IDENTITY_PRIOR, STEPS, strict=True):
         seen = problem.weight * _facing(problem, state)
         state = _solve(replace(problem, weight=seen, identity_prior=prior), state, steps)
-    distance = (_project(problem, state)[0] - problem.target).norm(dim=-1)
+    distance = (_project(problem, state)[0] - problem.target).norm(dim=-1)[:, : problem.landmarks]
     return replace(state, error=distance.mean(-1) / problem.pixel_unit)
+
+
+def _with_marks(problem: _Problem, exact: HeadModel, marks: SurfaceMarks, size: int) -> _Problem:
+    """The problem with surface marks; together they weigh `MARK_SHARE` of what a photo's landmarks do."""
+    trust = marks.weight.double()
+    share = MARK_SHARE * problem.landmarks / trust.sum(1, keepdim=True).clamp_min(0.2 * trust.shape[1])
+    normal = marks.on(exact, vertex_normals(exact.template, exact.faces))
+    return replace(
+        problem,
+        points=torch.cat((problem.points, marks.on(exact, exact.template))),
+        identity=torch.cat((problem.identity, marks.on(exact, exact.identity_basis)), 1),
+        expression=torch.cat((problem.expression, marks.on(exact, exact.expression_basis)), 1),
+        target=torch.cat((problem.target, marks.place.double() - size / 2), 1),
+        weight=torch.cat((problem.weight, share * trust), 1),
+        normal=torch.cat((problem.normal, normalize(normal, dim=-1))),
+        shape_rows=torch.cat((problem.shape_rows, torch.ones(trust.shape[1], dtype=torch.float64))),
+        scale=torch.cat((problem.scale, torch.full(trust.shape[1:], MARK_ROBUST_SCALE, dtype=torch.float64))),
+    )
 
 
 def eye_distance(head: HeadModel) -> float:
@@ -165,14 +215,16 @@ def _facing(problem: _Problem, state: LandmarkFit) -> Tensor:
     _, camera = _project(problem, state)
     cosine = -(problem.normal @ state.rotation.mT * normalize(camera, dim=-1)).sum(-1)
     frontal = state.rotation[:, 2, 2].abs()
-    photo = (frontal / frontal.max()) ** TURN_POWER
-    return (cosine / LANDMARK_FACING).clamp(LANDMARK_HIDDEN_TRUST, 1.0).square() * photo[:, None]
+    # A detector's marks are biased on turned faces, those of the surface are not.
+    photo = (frontal / frontal.max())[:, None] ** TURN_POWER * torch.ones_like(cosine)
+    photo[:, problem.landmarks :] = 1.0
+    return (cosine / LANDMARK_FACING).clamp(LANDMARK_HIDDEN_TRUST, 1.0).square() * photo
 
 
 def _cost(problem: _Problem, state: LandmarkFit) -> Tensor:
     pixels, camera = _project(problem, state)
     square = ((pixels - problem.target) / problem.pixel_unit[:, None, None]).square().sum(-1)
-    robust = PHOTO_ROBUST_SCALE**2 * square / (PHOTO_ROBUST_SCALE**2 + square) / LANDMARK_NOISE**2
+    robust = problem.scale**2 * square / (problem.scale**2 + square) / LANDMARK_NOISE**2
     outside = state.expression - state.expression.clamp(0, 1)
     cost = (problem.weight * robust).sum() + problem.identity_prior * state.identity.square().sum()
     cost = cost + LANDMARK_EXPRESSION_PRIOR * state.expression.square().sum() + BOUND_WEIGHT * outside.square().sum()
@@ -205,7 +257,7 @@ def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Te
     N, L = pixels.shape[:2]
     E = state.expression.shape[1]
     residual = (pixels - problem.target) / problem.pixel_unit[:, None, None]
-    robust = (PHOTO_ROBUST_SCALE**2 / (PHOTO_ROBUST_SCALE**2 + residual.square().sum(-1))).square()
+    robust = (problem.scale**2 / (problem.scale**2 + residual.square().sum(-1))).square()
     root = (problem.weight * robust).sqrt()[..., None] / LANDMARK_NOISE
     focal = state.focal[:, None] / problem.pixel_unit[:, None]
     d_camera = torch.from_numpy(projection_jacobian(camera.numpy(), focal.numpy()))

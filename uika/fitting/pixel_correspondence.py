@@ -45,8 +45,7 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         normal = normalize((vertex_normals(vertices[n], head.faces)[corners] * mix[..., None]).sum(-2), dim=-1)
         surface = (vertices[n][corners] * mix[..., None]).sum(-2)
         cosine = (normal * normalize(camera.position - surface, dim=-1)).sum(-1)
-        inner = -max_pool2d(-matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
-        trust = _ramp(inner, SURE_MATTE, FULL_MATTE) * _ramp(cosine, PIXEL_GRAZING, PIXEL_FACING)
+        trust = matte_trust(matte) * _ramp(cosine, PIXEL_GRAZING, PIXEL_FACING)
         trust = trust * (1 - (lid_doubt(head, fit.parameters[n], fit.static_offset)[corners] * mix).sum(-1))
         if fit.landmarks is not None and {"eyeballs", "mouth_inner"} <= set(head.masks):
             shares = ((head.masks[name][corners] * mix).sum(-1) * hit for name in ("eyeballs", "mouth_inner"))
@@ -56,6 +55,12 @@ def pixel_uv(fit: Fit, head: HeadModel, mattes: Tensor) -> tuple[Tensor, Tensor,
         valid.append(seen)
         weight.append(trust * seen)
     return torch.stack(uv), torch.stack(valid), torch.stack(weight)
+
+
+def matte_trust(matte: Tensor) -> Tensor:
+    """Trust [H,W] in [0,1] in the pixels of a matte [H,W]: none at its edge, where colours are mixed."""
+    inner = -max_pool2d(-matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
+    return _ramp(inner, SURE_MATTE, FULL_MATTE)
 
 
 def _ramp(value: Tensor, low: float, high: float) -> Tensor:

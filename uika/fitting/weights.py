@@ -11,6 +11,8 @@ FRAME_ROBUST_SCALE = 0.08  # the identity is known: what is far off is mostly a 
 LANDMARK_FACING = 0.6  # cosine of the viewing angle from which a landmark has full trust
 LANDMARK_HIDDEN_TRUST = 0.1  # trust of a landmark seen edge-on: the detector guesses there
 LANDMARK_EXPRESSION_PRIOR = 2.0  # per squared activation
+MARK_SHARE = 0.5  # weight of all surface marks of a photo over that of its landmarks: neighbours err alike
+MARK_ROBUST_SCALE = 0.1  # what an estimator sees is rougher than a detector's landmarks, and at times far off
 
 # Colours of surface points.
 GREY_NOISE = 0.03  # expected error of a grey level

@@ -85,6 +85,27 @@ class EstimatorConfig:
 
 
 @dataclass(frozen=True)
+class SurfaceEstimatorConfig:
+    """The small correspondence estimator (`uika.model.surface_estimator`).
+
+    size     side of the pictures that it sees, pixels; a multiple of 2^(number of widths)
+    widths   channels at 1/2, 1/4, ... of that side
+    blocks   residual blocks at each of them
+    table    side of the atlas whose texels are kept to find UV coordinates
+    """
+
+    size: int = 128
+    widths: tuple[int, ...] = (24, 48, 96, 144, 168)
+    blocks: tuple[int, ...] = (1, 1, 2, 2, 2)
+    table: int = 128
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if len(self.widths) != len(self.blocks) or self.size % 2 ** len(self.widths):
+            raise ValueError(f"size must be a multiple of 2^levels, with one width and one count each, not {self}")
+
+
+@dataclass(frozen=True)
 class ModelConfig:
     """Architecture of a `Reconstructor`.
 

@@ -149,6 +149,10 @@ def load(
     except SizeError as error:
         raise CheckpointError(f"{path}: {listing('missing or misshapen', error.names)}") from error
     located = own if own is not None else read_estimator(estimator or path)
+    if not isinstance(located, Estimator):
+        raise CheckpointError(
+            f"{estimator}: sees photos one by one; released weights need an estimator of the paper's kind"
+        )
     model = ReleasedModel(network, located, tables)
     if dtype == torch.bfloat16:
         model.halve()

@@ -63,7 +63,7 @@ class CanonicalHead:
             self._surface, self.binding = surface_texels(head, self.identity, self.static_offset, config.map_size)
             prior = self._prior
         self._head, self._config = head, config
-        self._estimator, self._levels = loaded.estimator, list[Tensor]()
+        self._loaded, self._levels = loaded, list[Tensor]()
         self._session = Session(loaded.network, self.binding.texel, self._surface, keep, prior, growing=growing)
         self._run, self._on_template = loaded.run, loaded.on_template
         self._lit: LightSample | None = None
@@ -107,14 +107,17 @@ class CanonicalHead:
 
     def _located(self, fit: Fit | None, images: Tensor, mattes: Tensor) -> tuple[Tensor, Tensor]:
         """UV maps [1,N,2,S,S], NaN where a pixel shows no part of the head, and the trust [N,S,S] in them."""
-        if self._estimator is not None:
-            uv = self._estimator(images[None]).float()
-            return torch.where(mattes[None, :, None] > 0, uv, torch.nan), mattes
         from uika.fitting import pixel_uv
+        from uika.reconstruction.estimated_pixels import consent, estimated_pixels
 
+        if self._loaded.estimator is not None and self._loaded.correspondence == "network":
+            return estimated_pixels(self._loaded.estimator, images, mattes)
         assert fit is not None  # LoadedModel.needs_fit
         uv, valid, weight = pixel_uv(fit, self._head, mattes)
-        return torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)[None], weight
+        uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)
+        if self._loaded.sight is not None:
+            weight = weight * consent(self._loaded.sight, images, uv)
+        return uv[None], weight
 
     def _under_one_light(self, fit: Fit, images: Tensor, uv: Tensor, weight: Tensor) -> Tensor:
         """The photos as if taken under the light of the most frontal one of the first call."""

@@ -49,7 +49,7 @@ class EstimatedLandmarks:
         person = torch.from_numpy((person_mask(crop) > 0.5).astype(np.float32))
         image = torch.from_numpy(crop.astype(np.float32) / 255).permute(2, 0, 1) * person + (1 - person)
         uv = self._estimator(image[None, None])[0, 0].float()
-        found, seen = self.places(uv, person > 0)
+        found, seen = self.places(uv, (person > 0) & torch.isfinite(uv[0]))
         moved = landmarks.copy()
         places = to_photo(found.numpy().astype(np.float64), square, SIDE)
         ids = self._ids[seen.numpy()]

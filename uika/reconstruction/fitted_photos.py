@@ -120,7 +120,14 @@ def fit_prepared(
         with report.stage("fit"):
             pictures = [photo.image for photo in photos] if refine else None
             focals = [photo.focal for photo in photos]
-            fit = fit_photos(photos, head, [each.hair for each in ordered], images=pictures, focals=focals, known=known)
+            marks = None
+            if loaded is not None and loaded.sight is not None:
+                from uika.reconstruction.surface_marks import surface_marks
+
+                shown = torch.stack([photo.image for photo in photos]), torch.stack([photo.matte for photo in photos])
+                marks = surface_marks(loaded.sight, head, *shown)
+            found = [each.hair for each in ordered]
+            fit = fit_photos(photos, head, found, images=pictures, focals=focals, known=known, marks=marks)
     pairs = [(photo.image, photo.matte) for photo in photos]
     if loaded is not None and loaded.released is not None:
         pairs = [released_view(photo) for photo in photos]

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from uika.assets import TINY_WEIGHTS
+from uika.assets import CORRESPONDENCE_WEIGHTS, TINY_WEIGHTS
 from uika.errors import UikaError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from uika.head import Binding, HeadModel
-    from uika.model import Estimator, Reconstructor
+    from uika.model import Reconstructor
+    from uika.model.estimator_file import AnyEstimator
     from uika.model.released import ReleasedModel
+    from uika.model.surface_estimator import SurfaceEstimator
 
+# Who says what a pixel shows: the fitted head; an estimator; the fitted head, in whose fit an estimator had a say.
+Correspondence = Literal["fit", "network", "both"]
+DEFAULT_CORRESPONDENCE: Correspondence = "fit"
 _NAMES = ("tiny", "none")
 
 
@@ -24,8 +29,17 @@ class LoadedModel(NamedTuple):
     network: Reconstructor
     name: str
     run: bool  # or only say what the photos show
-    estimator: Estimator | None = None  # finds the correspondence, else the fitted head does
+    estimator: AnyEstimator | None = None  # finds or helps to find the correspondence, else the fitted head does
     released: ReleasedModel | None = None  # the network with its tables, if it is the authors'
+    correspondence: Correspondence = "fit"
+
+    @property
+    def sight(self) -> SurfaceEstimator | None:
+        """The estimator that has a say in the fit, if one has."""
+        from uika.model.surface_estimator import SurfaceEstimator
+
+        helps = self.correspondence == "both" and isinstance(self.estimator, SurfaceEstimator)
+        return self.estimator if helps else None  # type: ignore[return-value]
 
     @property
     def on_template(self) -> bool:
@@ -57,7 +71,12 @@ class LoadedModel(NamedTuple):
         return binding, surface.points[0]
 
 
-def check_model(model: str | Path, estimator: str | Path | None = None, backbone: str | Path | None = None) -> None:
+def check_model(
+    model: str | Path,
+    estimator: str | Path | None = None,
+    backbone: str | Path | None = None,
+    correspondence: Correspondence | None = None,
+) -> None:
     """Refuse files that `reconstruct` could not use, from their headers, before other work starts.
 
     Raises:
@@ -71,6 +90,10 @@ def check_model(model: str | Path, estimator: str | Path | None = None, backbone
     kind = "model" if str(model) in _NAMES else check_kind(model, MODELS)
     if estimator is not None:
         check_kind(estimator, ESTIMATORS)
+        if correspondence == "fit":
+            raise UikaError(f"--estimator {estimator}: --correspondence fit asks no estimator; leave one of them out")
+    if kind == "released model" and correspondence not in (None, "network"):
+        raise UikaError(f"{model}: released weights need an estimator; leave --correspondence {correspondence} out")
     if backbone is not None:
         if kind != "released model":
             raise UikaError(
@@ -80,30 +103,42 @@ def check_model(model: str | Path, estimator: str | Path | None = None, backbone
 
 
 def load_model(
-    model: str | Path, estimator: str | Path | None = None, backbone: str | Path | None = None
+    model: str | Path,
+    estimator: str | Path | None = None,
+    backbone: str | Path | None = None,
+    correspondence: Correspondence | None = None,
 ) -> LoadedModel:
     """The model of a name or file that `reconstruct` takes.
+
+    `correspondence` None stands for "network" with an estimator's file, else for the default; without a file, "network"
+    and "both" take the estimator that comes with the program.
 
     Raises:
         ValueError: a name or file cannot be used.
     """
     from uika.model import build, load_checkpoint
     from uika.model.estimator_file import read_estimator
+    from uika.model.surface_estimator import SurfaceEstimator
     from uika.model.weight_kind import weight_kind
 
-    check_model(model, estimator, backbone)
+    check_model(model, estimator, backbone, correspondence)
     if str(model) not in _NAMES and weight_kind(model) == "released model":
         from uika.model import released
 
         whole = released.load(model, estimator=estimator, backbone=backbone)
-        return LoadedModel(whole.network, f"released ({Path(model).name})", True, whole.estimator, whole)
-    located = None if estimator is None else read_estimator(estimator)
+        name = f"released ({Path(model).name})"
+        return LoadedModel(whole.network, name, True, whole.estimator, whole, "network")
+    way = correspondence or ("network" if estimator is not None else DEFAULT_CORRESPONDENCE)
+    located = None if way == "fit" else read_estimator(estimator or CORRESPONDENCE_WEIGHTS)
+    if way == "both" and not isinstance(located, SurfaceEstimator):
+        raise UikaError(f"{estimator}: does not say how sure it is; use it with --correspondence network")
     if str(model) == "tiny":
-        return LoadedModel(load_checkpoint(TINY_WEIGHTS), "tiny", True, located)
+        return LoadedModel(load_checkpoint(TINY_WEIGHTS), "tiny", True, located, correspondence=way)
     if str(model) == "none":
-        return LoadedModel(build("tiny").eval(), "none", False, located)
+        return LoadedModel(build("tiny").eval(), "none", False, located, correspondence=way)
     network = load_checkpoint(model)
-    return LoadedModel(network, f"{network.config.name} ({Path(model).name})", True, located)
+    name = f"{network.config.name} ({Path(model).name})"
+    return LoadedModel(network, name, True, located, correspondence=way)
 
 
 def check_loaded(loaded: LoadedModel, head: HeadModel, estimator: str | Path | None = None) -> None:
@@ -122,5 +157,7 @@ def check_loaded(loaded: LoadedModel, head: HeadModel, estimator: str | Path | N
     head = head.without_bust
     if estimator is not None:
         check_estimator_head(estimator, head)
+    elif loaded.estimator is not None and loaded.released is None:
+        check_estimator_head(CORRESPONDENCE_WEIGHTS, head)
     if loaded.on_template:
         loaded.template(head)

@@ -18,7 +18,7 @@ from uika.photo_splats import PhotoView
 from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
-from uika.reconstruction.models import LoadedModel, check_loaded, load_model
+from uika.reconstruction.models import Correspondence, LoadedModel, check_loaded, load_model
 from uika.reconstruction.outside import with_outside, with_views
 from uika.reconstruction.report import Report
 
@@ -47,6 +47,7 @@ def reconstruct(
     *,
     estimator: str | Path | None = None,
     backbone: str | Path | None = None,
+    correspondence: Correspondence | None = None,
     refine: bool = True,
     keep: Keep = "all",
     photo_splats: bool = True,
@@ -64,6 +65,9 @@ def reconstruct(
         estimator: a correspondence estimator that says what each pixel shows, in the place of the fitted head or of the
             one that released weights bring.
         backbone: DINOv3 weights for released weights without their own.
+        correspondence: what says what each pixel shows: "fit", the fitted head; "network", an estimator, the built-in
+            one where no other is given; "both", the fitted head, in whose fit an estimator had a say. None stands for
+            "network" where `estimator` is given, else for the default.
         refine: whether to refine the fit with the colours that two or more photos share.
         keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
         photo_splats: whether to add splats for what the photos show outside the fitted surface; a model whose Gaussians
@@ -79,7 +83,7 @@ def reconstruct(
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
     report = Report() if report is None else report
     with report.stage("model"):
-        loaded = load_model(model, estimator, backbone)
+        loaded = load_model(model, estimator, backbone, correspondence)
         head = load_head() if head is None else head
         check_loaded(loaded, head, estimator)
     alone, bust = head.without_bust, loaded.takes_bust(head)

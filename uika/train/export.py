@@ -13,7 +13,7 @@ from uika._version import __version__
 from uika.head import HeadModel
 from uika.model import CheckpointError, Estimator, Reconstructor, load_checkpoint, save_checkpoint
 from uika.model.config import ModelConfig
-from uika.model.estimator_file import read_estimator, save_estimator
+from uika.model.estimator_file import AnyEstimator, read_estimator, save_estimator
 from uika.model.weight_kind import check_kind
 from uika.train.checkpoint import Progress
 from uika.train.config import TrainConfig
@@ -54,7 +54,7 @@ def load_start(task: Task, path: Path) -> None:
     Raises:
         CheckpointError: the file cannot be read, or is of another architecture.
     """
-    stored: Reconstructor | Estimator
+    stored: Reconstructor | AnyEstimator
     if isinstance(task.model, Reconstructor):
         check_kind(path, ("model",))
         stored = load_checkpoint(path)

@@ -14,6 +14,7 @@ from uika.canonical.surface import canonical_binding, mirror_map
 from uika.head import HeadModel, pose_gaussians, skin_points
 from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
+from uika.model.estimator_file import AnyEstimator
 from uika.train.config import TrainConfig
 from uika.train.dataset import Item
 from uika.train.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
@@ -40,7 +41,7 @@ class Task(Protocol):
 class GaussianNetwork(nn.Module):
     """Items to Gaussians; the module that is distributed, so that its parameters are gathered on the way in."""
 
-    def __init__(self, model: Reconstructor, head: HeadModel, estimator: Estimator | None = None) -> None:
+    def __init__(self, model: Reconstructor, head: HeadModel, estimator: AnyEstimator | None = None) -> None:
         """`head` decides the texels; `estimator`, which is not trained, finds the correspondence of the photos."""
         super().__init__()
         self.model = model
@@ -90,7 +91,7 @@ class ReconstructionTask:
         config: TrainConfig,
         head: HeadModel,
         perceptual: Lpips | None = None,
-        estimator: Estimator | None = None,
+        estimator: AnyEstimator | None = None,
     ) -> None:
         """A fresh model of the preset; `perceptual` takes the place of the gradient loss, `estimator` that of fits."""
         self.model = build(config.model, config.seed)
@@ -238,7 +239,7 @@ def judge(task: Task, output: Sequence[Tensor], item: Item) -> Judgement:
 
 
 def make_task(
-    config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None, estimator: Estimator | None = None
+    config: TrainConfig, head: HeadModel, perceptual: Lpips | None = None, estimator: AnyEstimator | None = None
 ) -> Task:
     """The task of a config."""
     if config.part == "estimator":
