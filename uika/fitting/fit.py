@@ -11,8 +11,9 @@ from torch import Tensor
 
 from uika.fitting.hair import fit_hair
 from uika.fitting.landmark_bias import unbiased
-from uika.fitting.landmarks import SurfaceMarks, fit_landmarks
+from uika.fitting.landmarks import fit_landmarks
 from uika.fitting.refinement import Gain, refine_landmark_fit
+from uika.fitting.surface_marks import SurfaceMarks
 from uika.fitting.teeth import teeth_offset
 from uika.head import Camera, HeadModel, HeadParameters
 

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from uika.fitting.jacobians import projection_jacobian
+from uika.fitting.normal_equations import own_steps, shared_steps
+from uika.fitting.surface_marks import SurfaceMarks
 from uika.fitting.weights import (
     LANDMARK_EXPRESSION_PRIOR,
     LANDMARK_FACING,
@@ -52,24 +54,6 @@ class LandmarkFit:
     translation: Tensor
     focal: Tensor
     error: Tensor
-
-
-@dataclass(frozen=True)
-class SurfaceMarks:
-    """Where photos show D points of the head's surface, beside the landmarks of a detector.
-
-    triangle [D] and barycentric [D,3] of the points; place [N,D,2] crop pixels; weight [N,D] trust in [0,1], 0 where a
-    photo does not show the point.
-    """
-
-    triangle: Tensor
-    barycentric: Tensor
-    place: Tensor
-    weight: Tensor
-
-    def on(self, head: HeadModel, vertices: Tensor) -> Tensor:
-        """The points [...,D,3] on a head with vertices [...,V,3]."""
-        return (vertices[..., head.faces[self.triangle], :] * self.barycentric[..., None].to(vertices.dtype)).sum(-2)
 
 
 @dataclass(frozen=True)
@@ -240,7 +224,7 @@ def _solve(problem: _Problem, state: LandmarkFit, steps: int) -> LandmarkFit:
     for _ in range(steps):
         system = _normal_equations(problem, state)
         while damping < MAX_DAMPING:
-            trial = _apply(state, *(_own_steps if problem.known else _schur_step)(*system, damping))
+            trial = _apply(state, *(own_steps if problem.known else shared_steps)(*system, damping))
             trial_cost = _cost(problem, trial)
             if trial_cost <= cost:
                 break
@@ -291,24 +275,6 @@ def _normal_equations(problem: _Problem, state: LandmarkFit) -> tuple[Tensor, Te
     C[:, E + 6, E + 6] += noted / LENS_SPREAD**2
     c[:, E + 6] += torch.where(noted, (state.focal / problem.lens).log() / LENS_SPREAD**2, 0.0)
     return A, B, C, a, c
-
-
-def _schur_step(A: Tensor, B: Tensor, C: Tensor, a: Tensor, c: Tensor, damping: float) -> tuple[Tensor, Tensor]:
-    """Solve for the shared step [K] and the photos' steps [N,P]."""
-    C = C + torch.diag_embed(damping * C.diagonal(dim1=-2, dim2=-1) + 1e-9)
-    A = A + torch.diag(damping * A.diagonal())
-    factor = torch.linalg.cholesky(C)
-    eliminated = torch.cholesky_solve(torch.cat((B.mT, c[..., None]), -1), factor)
-    reduced = A - (B @ eliminated[..., :-1]).sum(0)
-    right = a - (B @ eliminated[..., -1:]).sum(0)[:, 0]
-    shared = -torch.linalg.solve(reduced, right)
-    return shared, -(eliminated[..., -1] + eliminated[..., :-1] @ shared)
-
-
-def _own_steps(A: Tensor, B: Tensor, C: Tensor, a: Tensor, c: Tensor, damping: float) -> tuple[Tensor, Tensor]:
-    """The photos' steps [N,P] where nothing is shared; the shared step [K] is 0."""
-    C = C + torch.diag_embed(damping * C.diagonal(dim1=-2, dim2=-1) + 1e-9)
-    return torch.zeros_like(a), -torch.cholesky_solve(c[..., None], torch.linalg.cholesky(C))[..., 0]
 
 
 def _apply(state: LandmarkFit, shared: Tensor, photos: Tensor) -> LandmarkFit:

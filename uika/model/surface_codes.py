@@ -60,7 +60,10 @@ def codes_at(head: HeadModel, uv: Tensor, size: int = 1024) -> Tensor:
 
 
 def bound(head: HeadModel, uv: Tensor, size: int = 1024) -> tuple[Tensor, Tensor]:
-    """Triangles [P] and barycentrics [P,3] of places uv [P,2] (v down) in the atlas of a head without bust."""
+    """Triangles [P] and barycentrics [P,3] of places uv [P,2] (v down) in the atlas of a head without bust.
+
+    A place in a texel of `size` that an edge cuts may get the triangle beyond; its barycentrics then lie outside [0,1].
+    """
     near = _triangle_map(head, size)
     column, row = (uv * size).long().clamp(0, size - 1).unbind(-1)
     triangle = near[row, column]
@@ -69,7 +72,7 @@ def bound(head: HeadModel, uv: Tensor, size: int = 1024) -> tuple[Tensor, Tensor
     flat = torch.linalg.det(base).abs() < 1e-14
     base = torch.where(flat[:, None, None], torch.eye(2, dtype=base.dtype), base)
     share = torch.linalg.solve(base, (uv.double() - a)[..., None])[..., 0]
-    mix = torch.cat((1 - share.sum(-1, keepdim=True), share), -1).clamp(0, 1)
+    mix = torch.cat((1 - share.sum(-1, keepdim=True), share), -1).clamp(-1, 2)
     return triangle, (mix / mix.sum(-1, keepdim=True)).float()
 
 
