@@ -45,7 +45,7 @@ class ItemSettings:
     seed: int = 20
     size: int = 160  # pixels
     views: int = 9
-    moments: tuple[int, ...] = (2, 4)  # of a performance whose every fourth moment is a key expression
+    moments: tuple[int, ...] = (4,)  # of a performance whose every fourth moment is a key expression
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""

@@ -95,8 +95,8 @@ class SurfaceEstimatorConfig:
     """
 
     size: int = 128
-    widths: tuple[int, ...] = (24, 48, 96, 144, 168)
-    blocks: tuple[int, ...] = (1, 1, 2, 2, 2)
+    widths: tuple[int, ...] = (16, 32, 64, 128, 192)
+    blocks: tuple[int, ...] = (0, 1, 2, 2, 3)
     table: int = 128
 
     def __post_init__(self) -> None:

@@ -17,6 +17,7 @@ _SIDE, _SHIFT = (0.85, 1.4), 0.1  # side of the crop over that of the item, and 
 _MIRROR = 0.5
 _BODY, _FOUND, _PLAIN, _WHITE = 0.75, 0.8, 0.92, 0.75
 _COLOURLESS, _SHADE, _STREAK = 0.15, 0.6, 0.5
+_SMOOTH = 24  # cells of noise
 
 
 class SurfaceBatch(NamedTuple):
@@ -97,7 +98,9 @@ def _more(plane: Tensor, size: int) -> Tensor:
 def _noise(size: int, cells: tuple[int, int], channels: int, random: np.random.Generator) -> Tensor:
     """Smooth noise [C,S,S] of deviation about 1."""
     coarse = torch.from_numpy(random.normal(size=(1, channels, *cells)).astype(np.float32))
-    return functional.interpolate(coarse, size=(size, size), mode="bicubic", align_corners=False)[0]
+    if max(cells) < _SMOOTH:  # few cells would show their edges
+        coarse = functional.interpolate(coarse, size=(_SMOOTH, _SMOOTH), mode="bicubic", align_corners=False)
+    return functional.interpolate(coarse, size=(size, size), mode="bilinear", align_corners=False)[0]
 
 
 def _texture(size: int, random: np.random.Generator) -> Tensor:
@@ -188,8 +191,8 @@ def _lit(image: Tensor, random: np.random.Generator) -> Tensor:
     size = image.shape[-1]
     if random.random() < _SHADE:
         cells = (int(random.integers(2, 5)), int(random.integers(2, 5)))
-        image = image * (random.uniform(0.1, 0.45) * _noise(size, cells, 1, random)).exp()
-    gains = np.exp(random.normal(-0.05, 0.18) + random.normal(0, 0.1, 3))
+        image = image * (random.uniform(0.1, 0.4) * _noise(size, cells, 1, random)).exp()
+    gains = np.exp(random.normal(-0.08, 0.16) + random.normal(0, 0.1, 3))
     image = (image.clamp(0, 1) ** float(np.exp(random.normal(0, 0.25)))) * torch.from_numpy(gains).float()[
         :, None, None
     ]

@@ -38,8 +38,9 @@ class SurfaceTraining:
     architecture: SurfaceEstimatorConfig = field(default_factory=SurfaceEstimatorConfig)
     steps: int = 4000
     people: int = 440
-    held_out: int = 40
+    held_out: int = 30
     batch: int = 16
+    coarse: int = 1500  # first steps, with pictures of three quarters of the side, which cost half as much
     learning_rate: float = 2e-3
     warmup: int = 100
     cooldown: float = 0.3  # last share of the steps, over which the rate falls to nothing
@@ -141,7 +142,7 @@ def _draw(items: SurfaceItems, config: SurfaceTraining, step: int) -> SurfaceBat
     for place in range(step * config.batch, (step + 1) * config.batch):
         epoch, index = divmod(place, len(items))
         rows.append(items[int(np.random.default_rng([config.seed, epoch]).permutation(len(items))[index])])
-    size = config.architecture.size
+    size = config.architecture.size if step >= config.coarse else 3 * config.architecture.size // 4
     batch = make_batch(rows, size, size // 2, config.seed + 1000 * step)
     flips = torch.from_numpy(np.random.default_rng([config.seed, step, 1]).random(config.batch) < 0.5)
     return mirrored(batch, flips)
