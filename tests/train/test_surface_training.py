@@ -20,7 +20,7 @@ from uika.train.surface_training import LOG, MODEL_FILE, SurfaceTraining, train_
 
 ARCHITECTURE = SurfaceEstimatorConfig(size=64, widths=(8, 16, 16), blocks=(1, 1, 1), table=64)
 SHORT = SurfaceTraining(
-    ARCHITECTURE, steps=12, people=2, held_out=1, batch=4, coarse=3, warmup=2, save_every=6, judged=4, learning_rate=4e-3
+    ARCHITECTURE, 12, people=2, held_out=1, batch=4, coarse=3, warmup=2, save_every=6, judged=4, learning_rate=4e-3
 )
 
 

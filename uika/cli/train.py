@@ -29,7 +29,7 @@ class Train:
     preset: Literal["tiny", "base", "paper"] = "tiny"
     """Size of the network, and its training."""
     part: Literal["reconstructor", "estimator", "correspondence"] = "reconstructor"
-    """Which network; correspondence is the small estimator."""
+    """Which network."""
     steps: int | None = None
     """Steps in all."""
     resume: bool = False

@@ -12,7 +12,7 @@ from uika.head import HeadModel, load_head
 from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_prepared, prepare_files
-from uika.reconstruction.models import check_loaded, load_model
+from uika.reconstruction.models import Correspondence, check_loaded, load_model
 from uika.reconstruction.outside import with_outside
 from uika.reconstruction.photos_to_avatar import MAX_PHOTOS, assemble, with_doubts
 from uika.reconstruction.report import Report
@@ -37,6 +37,7 @@ class GrowingAvatar:
         *,
         estimator: str | Path | None = None,
         backbone: str | Path | None = None,
+        correspondence: Correspondence | None = None,
         photo_splats: bool = True,
     ) -> None:
         """Arguments as in `uika.reconstruct`.
@@ -44,7 +45,7 @@ class GrowingAvatar:
         Raises:
             ValueError: the model's name or file cannot be used.
         """
-        self._loaded = load_model(model, estimator, backbone)
+        self._loaded = load_model(model, estimator, backbone, correspondence)
         self._head = load_head() if head is None else head
         check_loaded(self._loaded, self._head, estimator)
         self._keep: Keep = keep
