@@ -66,6 +66,14 @@ class Capture:
         return max(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()), 1e-6)
 
 
+def is_there(path: Path) -> bool:
+    """Whether a path from a data set is that of a file; names that no file can have are none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def rigid(viewmat: NDArray[np.float64], source: str) -> Tensor:
     """A world-to-camera matrix [4,4] as float32.
 
@@ -74,6 +82,7 @@ def rigid(viewmat: NDArray[np.float64], source: str) -> Tensor:
     """
     turn = viewmat[:3, :3]
     sound = np.isfinite(viewmat).all() and np.abs(turn @ turn.T - np.eye(3)).max() < ROTATION_ERROR
+    sound = sound and np.abs(viewmat[3] - (0, 0, 0, 1)).max() < ROTATION_ERROR
     if not sound or np.linalg.det(turn) < 0:
         raise ValueError(f"{source}: its pose is no rotation with a translation")
     return torch.from_numpy(viewmat.astype(np.float32))

@@ -166,8 +166,11 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, _Camera]]:
+    parameters = dict(_MODELS.values())
     for line in filter(str.strip, _lines(path)):
         number, model, width, height, *values = line.split()
+        if len(values) != parameters.get(model, len(values)):
+            raise ValueError(f"camera model {model} has {parameters[model]} parameters, not {len(values)}")
         yield int(number), _Camera(model, int(width), int(height), tuple(map(float, values)))
 
 
@@ -178,11 +181,15 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...], tupl
             continue
         _, *numbers, camera, name = line.split(maxsplit=9)
         values = tuple(map(float, numbers))
+        if len(values) != 7:
+            raise ValueError(f"an image has {len(values)} numbers for its pose, not 7")
         next(lines, None)  # the points seen in it
         yield name.strip(), int(camera), values[:4], values[4:7]
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     for line in filter(str.strip, _lines(path)):
-        values = line.split()
-        yield (*map(float, values[1:4]), *map(float, values[4:7]))
+        values = tuple(map(float, line.split()[1:7]))
+        if len(values) != 6:
+            raise ValueError(f"a point has {len(values)} numbers for place and colour, not 6")
+        yield values

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from .captures import Capture
+from .captures import Capture, is_there
 from .colmap import colmap_folder, read_colmap
 from .transforms import read_blender, read_transforms
 
@@ -49,7 +49,7 @@ def _checked(capture: Capture) -> Capture:
     """The capture, if it has photos and their files are there."""
     if not capture.photos:
         raise ValueError("the data set has no photos with poses")
-    missing = [photo.path for photo in (*capture.photos, *capture.held_out) if not photo.path.is_file()]
+    missing = [photo.path for photo in (*capture.photos, *capture.held_out) if not is_there(photo.path)]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ValueError(f"{missing[0]}: the data set names this picture, which is not there{more}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from .._ply_table import read_header, read_rows, vertices
-from .captures import Capture, Photo, rigid
+from .captures import Capture, Photo, is_there, rigid
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -71,22 +72,24 @@ def _photo(path: Path, document: dict[str, Any], frame: Any, index: int) -> Phot
         cx, cy = float(known.get("cx", width / 2)), float(known.get("cy", height / 2))
         model = str(known.get("camera_model", "PINHOLE"))
         bent = [name for name in _DISTORTION if abs(float(known.get(name, 0.0))) > 0]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
         raise ValueError(f"{source} cannot be used ({type(error).__name__}: {error})") from None
     if model not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV") or bent:
         raise ValueError(f"{source}: undistort the pictures first; only pinhole cameras are trained ({model} {bent})")
     values = (fx, fy, cx, cy)
     if not all(map(math.isfinite, values)) or min(fx, fy) <= 0:
         raise ValueError(f"{source}: focal lengths and centre must be finite, focal lengths positive, not {values}")
-    sound = abs(np.linalg.det(matrix[:3, :3])) > 1e-9
-    viewmat = np.asarray(np.linalg.inv(matrix @ _FLIP) if sound else np.full((4, 4), np.nan), dtype=np.float64)
+    with contextlib.suppress(np.linalg.LinAlgError):
+        matrix = np.linalg.inv(matrix @ _FLIP)  # what has no inverse is no rotation either
+    if not 0 < width < 1 << 16 > height > 0:
+        raise ValueError(f"{source}: its picture cannot have {width} x {height} pixels")
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Photo(file, rigid(viewmat, source), K, width, height)
+    return Photo(file, rigid(matrix, source), K, width, height)
 
 
 def _found(path: Path) -> Path:
     """NeRF-synthetic leaves the ending out."""
-    return next((found for suffix in _SUFFIXES if (found := path.with_name(path.name + suffix)).is_file()), path)
+    return next((found for suffix in _SUFFIXES if is_there(found := path.with_name(path.name + suffix))), path)
 
 
 def _size(known: dict[str, Any], file: Path) -> tuple[int, int]:
@@ -116,7 +119,7 @@ def _focal(known: dict[str, Any], width: int, height: int) -> tuple[float, float
 
 def _point_cloud(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Points [P,3] of a `.ply`, and their colours [P,3] in [0,1] if it has any."""
-    if not path.is_file():
+    if not is_there(path):
         raise ValueError(f"{path}: the data set names this file of points, which is not there")
     header = read_header(path)
     vertices(path, header)

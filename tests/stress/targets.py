@@ -40,7 +40,7 @@ from uika.motion import (
 from uika.photo import PhotoError
 from uika.photo.read import read
 
-from . import more_targets, mutate, outside_targets, recordings
+from . import more_targets, mutate, outside_targets, recordings, splat_targets
 
 
 @dataclass(frozen=True)
@@ -231,5 +231,5 @@ TARGETS = {
     "transforms": Target(captures, mutate.text, _read_capture, DataError),
     "shard": Target(_shards, mutate.tar, _read_shard, DataError),
 }
-for more in (more_targets.TARGETS, recordings.TARGETS, outside_targets.TARGETS):
+for more in (more_targets.TARGETS, recordings.TARGETS, outside_targets.TARGETS, splat_targets.TARGETS):
     TARGETS |= {name: Target(*parts) for name, parts in more.items()}

@@ -79,6 +79,35 @@ def damaged(tmp_path: Path, kind: str) -> Path:
         document["frames"][2]["transform_matrix"][0][0] = 3.0
         (folder / "transforms.json").write_text(json.dumps(document))
         return folder
+    if kind == "transposed":
+        folder = write_nerfstudio(tmp_path)
+        document = json.loads((folder / "transforms.json").read_text())
+        for frame in document["frames"]:
+            frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+        (folder / "transforms.json").write_text(json.dumps(document))
+        return folder
+    if kind == "no pose":
+        folder = write_nerfstudio(tmp_path)
+        document = json.loads((folder / "transforms.json").read_text())
+        del document["frames"][1]["transform_matrix"]
+        (folder / "transforms.json").write_text(json.dumps(document))
+        return folder
+    if kind == "no size":
+        return write_nerfstudio(tmp_path, h=0)
+    if kind == "long name":
+        frames = [{"file_path": "x" * 5000, "transform_matrix": np.eye(4).tolist()}]
+        return write_nerfstudio(tmp_path, frames=frames)
+    if kind in ("few parameters", "short pose", "short point"):
+        folder = write_colmap(tmp_path, binary=False)
+        name, row = {"few parameters": ("cameras", 1), "short pose": ("images", 1), "short point": ("points3D", 0)}[
+            kind
+        ]
+        table = folder / "sparse" / "0" / f"{name}.txt"
+        lines = table.read_text().splitlines()
+        words = lines[row].split()
+        kept = {"cameras": words[:-1], "images": [*words[:5], *words[-2:]], "points3D": words[:5]}[name]
+        table.write_text("\n".join([*lines[:row], " ".join(kept), *lines[row + 1 :]]) + "\n")
+        return folder
     if kind == "distorted":
         return write_nerfstudio(tmp_path, k1=0.1)
     if kind == "no frames":
@@ -107,6 +136,13 @@ def damaged(tmp_path: Path, kind: str) -> Path:
         ("missing picture", r"003\.png.*not there"),
         ("another size", r"48x48 pixels; its camera says 49x48"),
         ("no rotation", "frame 2: its pose is no rotation"),
+        ("transposed", "frame 0: its pose is no rotation with a translation"),
+        ("no pose", r"frame 1 cannot be used \(KeyError: 'transform_matrix'\)"),
+        ("no size", "frame 0: its picture cannot have 48 x 0 pixels"),
+        ("long name", "the data set names this picture, which is not there"),
+        ("few parameters", r"cameras\.txt.*PINHOLE has 4 parameters, not 3"),
+        ("short pose", r"images\.txt.*no COLMAP table"),
+        ("short point", r"points3D\.txt.*a point has 4 numbers"),
         ("distorted", r"undistort.*k1"),
         ("no frames", "no photos"),
         ("not JSON", r"transforms\.json: cannot be read as JSON"),
