@@ -51,7 +51,8 @@ def colors_seen_from(coefficients: Any, means: Any, viewmat: Any, degree: int) -
     n, stride, channels = coefficients.shape
 
     def entry(row: int, column: int) -> Any:
-        return dr.gather(flat_type, viewmat.array, index_type(4 * row + column))
+        # With the mode left to Dr.Jit 1.5.0, several threads now and then lose a gradient of so few entries.
+        return dr.gather(flat_type, viewmat.array, index_type(4 * row + column), mode=dr.ReduceMode.Direct)
 
     def cross(a: list[Any], b: list[Any]) -> list[Any]:
         return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]

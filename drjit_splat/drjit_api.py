@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from . import _core
 from ._backend import Backend, backend_named
-from ._cameras import check_cameras
 from ._compat import settings_of
+from ._drjit_inputs import check_arguments, report_first_bad
 from ._harmonics_drjit import colors_seen_from
 from ._project import Arrays
 from ._settings import Options, Settings
-from .constants import MAX_CHECKED
 
 _NAMES = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks", "radial_coeffs")
+_PER_SPLAT = _NAMES[:6]
 
 
 class _Splat(dr.CustomOp):  # type: ignore[misc]
@@ -47,7 +47,7 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
         *_, coverage = _core.render(self.trace, self.arrays) if self.arrays.count else [None]
         p = self.trace.projected
         if p is not None and p.nonfinite:
-            _report_first_bad(self.tensors)
+            report_first_bad(self.tensors)
         if coverage is None:
             return dr.zeros(self.kind, (height, width, features)), dr.zeros(self.kind, (height, width, 1))
         sums = dr.empty(be.plain.Float, height * width * features)
@@ -56,6 +56,7 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
             for f in range(chunk.count):
                 value = dr.gather(be.plain.Float, chunk.image.features, chunk.count * pixel + f)
                 dr.scatter(sums, value, features * pixel + chunk.first + f, mode=dr.ReduceMode.Permute)
+        dr.eval(sums)
         return (
             self.kind(_like(self.kind, sums), (height, width, features)),
             self.kind(_like(self.kind, coverage), (height, width, 1)),
@@ -82,10 +83,11 @@ class _Splat(dr.CustomOp):  # type: ignore[misc]
             trace, arrays, parts, grad_coverage, _core.Wanted(shape=True, opacities=True, colors=True, camera=True)
         )
         total = dr.sum(be.plain.TensorXf(g.inputs.camera, (arrays.count, 16)), axis=0).array
-        view, K = dr.zeros(be.plain.Float, 16), dr.zeros(be.plain.Float, 9)
-        twelve = dr.arange(be.plain.UInt32, 12)
-        dr.scatter(view, dr.gather(be.plain.Float, total, twelve), twelve)
-        dr.scatter(K, dr.gather(be.plain.Float, total, be.plain.UInt32(12, 13, 14, 15)), be.plain.UInt32(0, 4, 2, 5))
+        sixteen = dr.arange(be.plain.UInt32, 16)
+        view = dr.gather(be.plain.Float, total, sixteen, sixteen < 12)
+        places = be.plain.UInt32(12, 16, 14, 16, 13, 15, 16, 16, 16)  # of fx, cx, fy, cy; 16 stands for none
+        K = dr.gather(be.plain.Float, total, places, places < 16)
+        dr.eval(view, K)
         i = g.inputs
         found = (i.means, i.quats, i.scales, i.covars, i.opacities, g.colors, view, K, None)
         for name, gradient in zip(_NAMES, found, strict=True):
@@ -129,152 +131,143 @@ def _arrays(be: Backend, tensors: dict[str, Any]) -> Arrays:
     )
 
 
-def _report_first_bad(tensors: dict[str, Any]) -> None:
-    for name, tensor in tensors.items():
-        if tensor is None:
-            continue
-        values = tensor.numpy()
-        for index in np.argwhere(~np.isfinite(values))[:1].tolist():
-            raise ValueError(f"{name}{index} is {values[tuple(index)]}: every value must be finite in float32")
-
-
-def _check(tensors: dict[str, Any], settings: Settings, backgrounds: Any | None) -> None:
-    sizes: dict[str, int] = {}
-    per_splat: tuple[int | str, ...] = ("N", "D") if settings.sh_degree is None else ("N", "K", "D")
-    shapes: dict[str, tuple[int | str, ...]] = {
-        "means": ("N", 3),
-        "quats": ("N", 4),
-        "scales": ("N", 3),
-        "covars": ("N", 3, 3),
-        "opacities": ("N",),
-        "colors": per_splat,
-        "viewmats": ("C", 4, 4),
-        "Ks": ("C", 3, 3),
-        "radial_coeffs": ("C", 4),
-        "backgrounds": ("C", "D"),
-    }
-    needed = {"means", "opacities", "viewmats", "Ks"}
-    needed |= {"covars"} if tensors["covars"] is not None else {"quats", "scales"}
-    needed |= {"colors"} if settings.has_colors else set()
-    for name, tensor in (tensors | {"backgrounds": backgrounds}).items():
-        if tensor is None and name not in needed:
-            continue
-        if tensor is None or not dr.is_tensor_v(tensor) or not dr.is_float_v(tensor) or not dr.is_jit_v(tensor):
-            raise ValueError(
-                f"{name} must be a Dr.Jit tensor of a backend (drjit.llvm.ad.TensorXf), not {_kind(tensor)}"
-            )
-        wanted = "[" + ", ".join(str(s) for s in shapes[name]) + "]"
-        matches = len(tensor.shape) == len(shapes[name]) and all(
-            got == (sizes.setdefault(want, got) if isinstance(want, str) else want)
-            for got, want in zip(tensor.shape, shapes[name], strict=True)
-        )
-        if not matches:
-            raise ValueError(f"{name} must have the shape {wanted}, not {list(tensor.shape)}")
-    if sizes["C"] < 1:
-        raise ValueError("viewmats must hold at least one camera")
-    if tensors["colors"] is not None and sizes["D"] < 1:
-        raise ValueError("colors must have at least 1 channel, not 0")
-    if settings.has_colors and settings.sh_degree is not None and sizes["K"] < (settings.sh_degree + 1) ** 2:
-        least = (settings.sh_degree + 1) ** 2
-        raise ValueError(f"colors has {sizes['K']} harmonics a channel; sh_degree {settings.sh_degree} needs {least}")
-    if tensors["radial_coeffs"] is not None and settings.camera_model != "fisheye":
-        raise ValueError(f"radial_coeffs is for fisheye lenses, not {settings.camera_model}; undistort the images")
-    small = {name: tensors[name] for name in ("viewmats", "Ks", "radial_coeffs")} | {"backgrounds": backgrounds}
-    if tensors["colors"] is not None and (settings.sh_degree is not None or sizes["D"] > MAX_CHECKED):
-        small["colors"] = tensors["colors"]  # the projection kernel checks everything that it reads itself
-    _report_first_bad({name: None if t is None else dr.detach(t) for name, t in small.items()})
-    check_cameras(dr.detach(tensors["viewmats"]).numpy(), dr.detach(tensors["Ks"]).numpy())
-
-
-def _kind(value: Any) -> str:
-    return f"{type(value).__module__}.{type(value).__name__}"
-
-
 def rasterization(
-    means: Any,  # [N, 3]
-    quats: Any | None,  # [N, 4]
-    scales: Any | None,  # [N, 3]
-    opacities: Any,  # [N]
-    colors: Any | None,  # [N, D] or [N, K, D]
-    viewmats: Any,  # [C, 4, 4]
-    Ks: Any,  # [C, 3, 3]
+    means: Any,  # [..., N, 3]
+    quats: Any | None,  # [..., N, 4]
+    scales: Any | None,  # [..., N, 3]
+    opacities: Any,  # [..., N]
+    colors: Any | None,  # [..., (C,) N, D] or [..., (C,) N, K, D]
+    viewmats: Any,  # [..., C, 4, 4]
+    Ks: Any,  # [..., C, 3, 3]
     width: int,
     height: int,
     *,
-    backgrounds: Any | None = None,  # [C, D]
-    covars: Any | None = None,  # [N, 3, 3]
-    radial_coeffs: Any | None = None,  # [C, 4]
+    backgrounds: Any | None = None,  # [..., C, D]
+    covars: Any | None = None,  # [..., N, 3, 3]
+    radial_coeffs: Any | None = None,  # [..., C, 4]
     options: Options | None = None,
     **arguments: Any,
 ) -> tuple[Any, Any]:
-    """Render as `drjit_splat.rasterization` does; all arrays are float32 tensors of one Dr.Jit backend.
+    """Render as `drjit_splat.rasterization` does; all arrays are float32 tensors of one Dr.Jit type.
+
+    It cannot be part of a function under `drjit.freeze`: the length of the lists of splats must be read while it runs.
+    Its own kernels are frozen already; freeze what comes before and after it.
 
     Args:
-        means: [N, 3]; this and the others as in `drjit_splat.rasterization`, without batch dimensions.
-        quats: [N, 4].
-        scales: [N, 3].
-        opacities: [N].
-        colors: [N, D], or harmonics [N, K, D] when `sh_degree` is given; None without colours.
-        viewmats: [C, 4, 4].
-        Ks: [C, 3, 3].
+        means: [..., N, 3]; this and the others as in `drjit_splat.rasterization`.
+        quats: [..., N, 4].
+        scales: [..., N, 3].
+        opacities: [..., N].
+        colors: [..., N, D], or harmonics [..., N, K, D] when `sh_degree` is given, which may be without the batch's
+            dimensions; a set for each camera where C comes before N; None without colours.
+        viewmats: [..., C, 4, 4].
+        Ks: [..., C, 3, 3].
         width: pixels.
         height: pixels.
-        backgrounds: [C, D].
-        covars: [N, 3, 3].
-        radial_coeffs: [C, 4], without gradients.
+        backgrounds: [..., C, D].
+        covars: [..., N, 3, 3].
+        radial_coeffs: [..., C, 4], without gradients.
         options: accuracy and skips.
         arguments: `near_plane`, `far_plane`, `radius_clip`, `eps2d`, `sh_degree`, `render_mode`, `rasterize_mode`,
             `camera_model` and `semantics` of `drjit_splat.rasterization`; those of gsplat that change nothing.
 
     Returns:
-        colors [C, H, W, D (+ 1 with a depth)] and alphas [C, H, W, 1], differentiable in reverse mode.
+        colors [..., C, H, W, D (+ 1 with a depth)] and alphas [..., C, H, W, 1], differentiable in reverse mode.
 
     Raises:
         ValueError: an argument has a wrong shape, type or value, or holds a NaN or an infinity.
         TypeError: there is no such argument.
         MemoryError: the splats cover more tiles than can be stored.
-        RuntimeError: no LLVM library was found; the message says what to install.
+        RuntimeError: no LLVM library was found (the message says what to install), or a function is being frozen.
     """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise RuntimeError(
+            "drjit_api.rasterization cannot be recorded by drjit.freeze: it reads the length of its lists as it runs; "
+            "call it between frozen functions (its own kernels are frozen already)"
+        )
     settings = settings_of(width, height, options, arguments)
     if covars is not None:
         quats = scales = None
     values = (means, quats, scales, covars, opacities, colors, viewmats, Ks, radial_coeffs)
-    tensors = dict(zip(_NAMES, values, strict=True))
-    _check(tensors, settings, backgrounds)
-    kind = type(means)
+    tensors = dict(zip(_NAMES, values, strict=True)) | {"backgrounds": backgrounds}
+    batch = check_arguments(tensors, settings)
     images, coverages = [], []
-    for i in range(viewmats.shape[0]):
-        seen = colors
-        if not settings.has_colors:
-            seen = kind(dr.array_t(kind)(), (means.shape[0], 0))
-        elif settings.sh_degree is not None:
-            seen = colors_seen_from(colors, means, viewmats[i], settings.sh_degree)
-        radial = None if radial_coeffs is None else dr.detach(radial_coeffs[i])
-        one = tensors | {"colors": seen, "viewmats": viewmats[i], "Ks": Ks[i], "radial_coeffs": radial}
-        try:
-            sums, coverage = dr.custom(_Splat, settings, **one)
-        except RuntimeError as error:  # Dr.Jit wraps whatever goes wrong inside a custom operation
-            if isinstance(error.__cause__, (ValueError, MemoryError)):
-                raise error.__cause__ from None
-            raise
-        images.append(_finish(sums, coverage, None if backgrounds is None else backgrounds[i], settings))
+    cameras = viewmats.shape[-3]
+    parts = _parts(tensors, batch, settings)
+    for index in range(math.prod(batch) * cameras):
+        element = {name: part[index // cameras if name in _PER_SPLAT else index] for name, part in parts.items()}
+        image, coverage = _one(element, index % cameras, settings)
+        images.append(image)
         coverages.append(coverage)
-    return _stack(images), _stack(coverages)
+    shape = (*batch, cameras)
+    return _stack(images, shape), _stack(coverages, shape)
+
+
+def _parts(tensors: dict[str, Any], batch: tuple[int, ...], settings: Settings) -> dict[str, list[Any]]:
+    """The tensors of each element of the batch, or of each image."""
+    count = math.prod(batch)
+    images, found = count * tensors["viewmats"].shape[-3], {}
+    for name, tensor in tensors.items():
+        shared = name == "colors" and tensor is not None and settings.sh_degree is not None and tensor.ndim == 3
+        rows = count if name in _PER_SPLAT else images
+        if tensor is None or shared or (not batch and name in _PER_SPLAT):
+            found[name] = [tensor] * rows
+        else:
+            own = tensor.shape[len(batch) + (name not in _PER_SPLAT) :]
+            found[name] = [_part(tensor, index, own) for index in range(rows)]
+    return found
+
+
+def _part(tensor: Any, index: int, shape: tuple[int, ...]) -> Any:
+    """Part `index` of a tensor that consists of parts of this shape.
+
+    Indexing the tensor would do the same, but with several threads Dr.Jit 1.5.0 now and then loses a part's gradient
+    where the mode is left to it.
+    """
+    size, flat = math.prod(shape), dr.array_t(tensor)
+    places = dr.arange(dr.uint32_array_t(flat), size) + dr.opaque(dr.uint32_array_t(flat), index * size)
+    return type(tensor)(dr.gather(flat, tensor.array, places, mode=dr.ReduceMode.Permute), shape)
+
+
+def _one(tensors: dict[str, Any], camera: int, settings: Settings) -> tuple[Any, Any]:
+    """Image [H, W, F] and coverage [H, W, 1] of one camera."""
+    means, colors, viewmat = tensors["means"], tensors["colors"], tensors["viewmats"]
+    kind = type(means)
+    if not settings.has_colors:
+        seen = kind(dr.array_t(kind)(), (means.shape[0], 0))
+    else:
+        seen = colors if colors.ndim == (2 if settings.sh_degree is None else 3) else colors[camera]
+        if settings.sh_degree is not None:
+            seen = colors_seen_from(seen, means, viewmat, settings.sh_degree)
+    given = {name: tensors[name] for name in _NAMES} | {"colors": seen}
+    if tensors["radial_coeffs"] is not None:
+        given["radial_coeffs"] = dr.detach(tensors["radial_coeffs"])
+    try:
+        sums, coverage = dr.custom(_Splat, settings, **given)
+    except RuntimeError as error:  # Dr.Jit wraps whatever goes wrong inside a custom operation
+        if isinstance(error.__cause__, (ValueError, MemoryError)):
+            raise error.__cause__ from None
+        raise
+    return _finish(sums, coverage, tensors["backgrounds"], settings), coverage
 
 
 def _finish(sums: Any, coverage: Any, background: Any | None, settings: Settings) -> Any:
-    parts = []
-    if settings.has_colors:
-        color = sums[:, :, :-1] if settings.has_depth else sums
-        if background is not None:
-            color = color + (1 - coverage) * dr.reshape(background, (1, 1, -1))
-        parts.append(color)
-    if settings.has_depth:
-        depth = sums[:, :, -1:]
-        parts.append(depth / dr.select(coverage > 1e-10, coverage, 1e-10) if settings.expected_depth else depth)
-    return parts[0] if len(parts) == 1 else dr.concat(parts, axis=2)
+    """Sums [H, W, F] over the background; the depth channel, when there is one, is the last and has none."""
+    kind = type(sums)
+    features = sums.shape[2]
+    if settings.has_colors and background is not None:
+        values = background.array
+        if settings.has_depth:
+            values = dr.concat((values, dr.zeros(dr.array_t(kind), 1)))
+        sums = sums + (1 - coverage) * kind(values, (1, 1, features))
+    if settings.expected_depth:
+        place = dr.arange(dr.uint32_array_t(dr.array_t(kind)), features)
+        last = dr.mask_t(kind)(place == features - 1, (1, 1, features))
+        sums = dr.select(last, sums / dr.select(coverage > 1e-10, coverage, 1e-10), sums)
+    return sums
 
 
-def _stack(parts: list[Any]) -> Any:
+def _stack(parts: list[Any], shape: tuple[int, ...]) -> Any:
     grown: list[Any] = [dr.reshape(part, (1, *part.shape)) for part in parts]
-    return grown[0] if len(grown) == 1 else dr.concat(grown, axis=0)
+    whole = grown[0] if len(grown) == 1 else dr.concat(grown, axis=0)
+    return dr.reshape(whole, (*shape, *parts[0].shape))

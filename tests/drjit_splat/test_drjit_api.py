@@ -128,3 +128,112 @@ def test_other_arguments_are_checked_as_through_torch() -> None:
 
     with pytest.raises(ValueError, match=r"^means must be .* not drjit\.scalar"):
         drjit_api.rasterization(**(scene | {"means": Scalar([0.0] * 60, (20, 3))}), width=8, height=6)
+
+
+def tensors(scene: dict[str, torch.Tensor]) -> dict[str, Any]:
+    return {name: TensorXf(value.contiguous().numpy()) for name, value in scene.items()}
+
+
+@pytest.mark.parametrize(
+    ("harmonics", "each_camera"), [("none", False), ("none", True), ("own", False), ("own", True), ("shared", False)]
+)
+def test_batches_and_colors_of_each_camera_are_those_through_torch(harmonics: str, each_camera: bool) -> None:
+    single = [random_scene(count=40, width=20, height=16, cameras=2, seed=seed) for seed in range(2)]
+    batch = {name: torch.stack([scene[name] for scene in single])[None] for name in single[0]}
+    options: dict[str, Any] = {"width": 20, "height": 16, "render_mode": "RGB+ED"}
+    random = torch.Generator().manual_seed(3)
+    if harmonics != "none":
+        options["sh_degree"] = 1
+        shape = (40, 4, 3) if harmonics == "shared" else (1, 2, *(2,) * each_camera, 40, 4, 3)
+        batch["colors"] = 0.3 * torch.randn(shape, generator=random)
+    elif each_camera:
+        batch["colors"] = torch.rand(1, 2, 2, 40, 3, generator=random)
+    leaves = {name: value.clone().requires_grad_() for name, value in batch.items()}
+    expected, coverage, _ = rasterization(**leaves, **options)
+    given = tensors(batch)
+    dr.enable_grad(list(given.values()))
+    image, alpha = drjit_api.rasterization(**given, **options)
+    assert image.shape == tuple(expected.shape) == (1, 2, 2, 16, 20, 4) and alpha.shape == tuple(coverage.shape)
+    assert abs(image.numpy() - expected.detach().numpy()).max() < 1e-5
+    weight = torch.randn(expected.shape, generator=random)
+    (expected * weight).sum().backward()
+    dr.backward(dr.sum(image * TensorXf(weight.numpy())))
+    for name, leaf in leaves.items():
+        got = torch.from_numpy(dr.grad(given[name]).numpy().copy())
+        assert leaf.grad is not None and float((got - leaf.grad).norm()) <= 1e-5 * float(leaf.grad.norm()), name
+
+
+def test_one_type_of_float32_tensors_for_all() -> None:
+    from drjit.llvm import TensorXf as Plain
+    from drjit.llvm.ad import TensorXf64
+
+    scene = tensors(random_scene(count=20))
+    with pytest.raises(ValueError, match=r"^scales must hold float32 numbers"):
+        drjit_api.rasterization(**(scene | {"scales": TensorXf64(scene["scales"])}), width=8, height=8)
+    with pytest.raises(ValueError, match=r"^colors is a drjit\.llvm\.TensorXf, but means is a drjit\.llvm\.ad"):
+        drjit_api.rasterization(**(scene | {"colors": Plain(scene["colors"].numpy())}), width=8, height=8)
+
+
+def test_bad_batches_are_named_as_through_torch() -> None:
+    scene = random_scene(count=20)
+    batch = {name: value[None] for name, value in scene.items()}
+    cases: list[tuple[dict[str, torch.Tensor], dict[str, Any], str]] = [
+        (batch | {"quats": scene["quats"]}, {}, r"^quats must have the shape \[1, N, 4\]"),
+        (batch | {"backgrounds": batch["backgrounds"][..., :2]}, {}, r"^backgrounds must have the shape \[1, C, D\]"),
+        ({name: value[:0] for name, value in batch.items()}, {}, r"^means must have batch dimensions of at least 1"),
+        (batch | {"colors": batch["colors"][..., None, :]}, {"sh_degree": 1}, r"^colors has 1 harmonics a channel"),
+        (scene | {"radial_coeffs": torch.zeros(1, 4)}, {}, "^radial_coeffs is for fisheye lenses"),
+        (scene | {"viewmats": scene["viewmats"][:0], "Ks": scene["Ks"][:0]}, {}, "."),
+    ]
+    for arguments, options, message in cases:
+        with pytest.raises(ValueError, match=message):
+            rasterization(**arguments, width=8, height=8, **options)
+        with pytest.raises(ValueError, match=message):
+            drjit_api.rasterization(**tensors(arguments), width=8, height=8, **options)
+    lens = TensorXf([0.0] * 4, (1, 4))
+    dr.enable_grad(lens)
+    with pytest.raises(ValueError, match="radial_coeffs gets no gradient"):
+        drjit_api.rasterization(**tensors(scene), width=8, height=8, radial_coeffs=lens, camera_model="fisheye")
+
+
+def test_a_frozen_function_is_told_where_to_end_and_works_around_the_call() -> None:
+    @dr.freeze
+    def whole(scene: dict[str, Any]) -> Any:
+        return drjit_api.rasterization(**scene, width=16, height=16)[0]
+
+    with pytest.raises(RuntimeError) as refused:
+        whole(tensors(random_scene(count=20)))
+    assert "cannot be recorded by drjit.freeze" in str(refused.value.__cause__)
+
+    @dr.freeze
+    def before(means: Any, shift: Any) -> Any:
+        return means + shift
+
+    @dr.freeze
+    def after(image: Any) -> Any:
+        return dr.sum(image * image)
+
+    for seed in range(3):
+        scene = tensors(random_scene(count=20 + seed, seed=seed))
+        shift = TensorXf([0.01 * seed], (1, 1))
+        image = drjit_api.rasterization(**(scene | {"means": before(scene["means"], shift)}), width=16, height=16)[0]
+        plain = drjit_api.rasterization(**(scene | {"means": scene["means"] + shift}), width=16, height=16)[0]
+        assert (image.numpy() == plain.numpy()).all()
+        assert after(image).numpy() == pytest.approx((plain.numpy() ** 2).sum(), rel=1e-5)
+
+
+def test_no_camera_loses_its_gradient() -> None:
+    """Several threads once lost one in five of them, where Dr.Jit chose how to add up what comes from slices."""
+    single = [random_scene(count=40, width=20, height=16, cameras=2, seed=seed) for seed in range(2)]
+    scene = {name: torch.stack([part[name] for part in single]) for name in single[0]}
+    scene["colors"] = 0.3 * torch.randn(40, 4, 3, generator=torch.Generator().manual_seed(1))
+    first: dict[str, Any] = {}
+    for _ in range(15):
+        given = tensors(scene)
+        dr.enable_grad(list(given.values()))
+        image, _ = drjit_api.rasterization(**given, width=20, height=16, sh_degree=1, render_mode="RGB+ED")
+        dr.backward(dr.sum(image * image))
+        found = {name: dr.grad(tensor).numpy().copy() for name, tensor in given.items()}
+        first = first or found
+        for name, gradient in found.items():
+            assert abs(gradient - first[name]).max() <= 1e-4 * abs(first[name]).max(), name
