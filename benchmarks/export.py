@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from benchmarks.harness import markdown, save
-from drjit_splat import load_ply, rasterization, save_ply
+from drjit_splat import load_ply, load_spz, rasterization, save_ply
 from tests.chromium import page
 from tests.drjit_splat.common import random_scene
 from uika import Avatar, Camera, HeadModel, Motion, get_motion, load_head, neutral_camera
@@ -54,6 +54,12 @@ def from_ply(path: Path) -> Splats:
 def ply(path: Path, case: Case) -> Splats:
     files.write_ply(path, case.splats.half_turned())
     return from_ply(path).half_turned()
+
+
+def spz(path: Path, case: Case) -> Splats:
+    files.write_spz(path, case.splats)
+    file = load_spz(path)
+    return Splats(file.means, file.quats, file.scales, file.opacities, file.colors).turned_over()
 
 
 def splat(path: Path, case: Case) -> Splats:
@@ -195,7 +201,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     motion = get_motion("talk", head)
     posed = files.posed_splats(avatar, head, motion.parameters(avatar.identity)[FRAME])
     case = Case(avatar, head, motion, posed)
-    formats: dict[str, Written] = {".ply": ply, ".glb": glb, ".npz with a motion": npz, ".splat": splat}
+    formats: dict[str, Written] = {".ply": ply, ".glb": glb, ".npz with a motion": npz, ".splat": splat, ".spz": spz}
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         rows = [row(name, write, case, posed, folder) for name, write in formats.items()]

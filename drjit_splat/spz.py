@@ -23,6 +23,7 @@ MAGIC = b"NGSP"
 VERSION = 3  # that is written
 MAX_SPLATS = 10_000_000  # of one file, as the format's own program allows
 FRACTION_BITS = 12
+_MOST_BITS = 23  # of a position's 24, one is its sign
 _COLOR_SCALE = 0.15  # of the constant harmonic
 _SH_BUCKETS = (8, 16)  # steps of harmonics of the first degree and of the others
 _HALF_ROOT = float(np.sqrt(0.5))
@@ -69,6 +70,8 @@ def save_spz(
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
     harmonics: Tensor,  # [N, K, 3]
+    *,
+    fraction_bits: int = FRACTION_BITS,
 ) -> None:
     """Write a file of version 3; it appears under its name only when it is complete.
 
@@ -82,19 +85,24 @@ def save_spz(
         scales: [N, 3] standard deviations.
         opacities: [N] in [0, 1].
         harmonics: [N, K, 3] with K 1, 4, 9 or 16.
+        fraction_bits: of positions, 0 to 23; fewer are taken where the scene is too large for them. More make a finer
+            grid for what is small, and a larger file.
 
     Raises:
-        ValueError: there are too many splats, K is another number, or a value is not finite or too far away.
+        ValueError: there are too many splats, `fraction_bits` lies outside its range, K is another number, or a value
+            is not finite or too far away.
     """
     count, K = len(means), harmonics.shape[1]
     if K not in (1, 4, 9, 16) or count > MAX_SPLATS:
         raise ValueError(f"harmonics: {K} a channel and {count:,} splats; files hold 1, 4, 9 or 16 and {MAX_SPLATS:,}")
+    if not 0 <= fraction_bits <= _MOST_BITS:
+        raise ValueError(f"fraction_bits must lie between 0 and {_MOST_BITS}, not {fraction_bits}")
     m, q, s, o, h = (value.detach().cpu().double().numpy() for value in (means, quats, scales, opacities, harmonics))
     for name, values in (("means", m), ("quats", q), ("scales", s), ("opacities", o), ("harmonics", h)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name}: every value must be finite")
     farthest = float(np.abs(m).max(initial=1e-3))
-    bits = min(FRACTION_BITS, int(np.floor(23 - np.log2(farthest) - 1e-6)))
+    bits = min(fraction_bits, int(np.floor(23 - np.log2(farthest) - 1e-6)))
     if bits < 0:
         raise ValueError(f"means: {farthest:g} is farther away than the format can say")
     fixed = np.rint(m * _FLIP * 2**bits).astype("<i4")
@@ -131,10 +139,10 @@ def _sizes(version: int, count: int, degree: int) -> list[int]:
 
 
 def _checked(path: Path, version: int, count: int, degree: int, bits: int) -> None:
-    if degree > 3 or count > MAX_SPLATS or bits > 23:
+    if degree > 3 or count > MAX_SPLATS or bits > _MOST_BITS:
         raise ValueError(
             f"{path} says {count:,} splats with harmonics of degree {degree} and {bits} bits; "
-            f"at most {MAX_SPLATS:,}, degree 3 and 23 can be read"
+            f"at most {MAX_SPLATS:,}, degree 3 and {_MOST_BITS} can be read"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 # Import name of each optional package -> the extra of this project that installs it.
 EXTRAS = {
     "av": "cli",
+    "c2pa": "sign",
     "openfacefx": "cli",
     "ai_edge_litert": "photo",
     "cv2": "view",

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from drjit_splat import load_ply
+from drjit_splat import load_ply, load_spz
 from uika.cli import main
 from uika.export import glb_provenance, html_provenance, read_splat
 
@@ -16,6 +16,8 @@ def test_every_format_is_written(folder, capsys):
     assert load_ply("a.ply").means[:, 1].tolist() == (-load_ply("b.ply").means[:, 1]).tolist()
     export("-o", "a.splat", "--motion", "talk", "--frame", "5", "--count", "100")
     assert len(read_splat("a.splat")) == 100
+    assert "Y up" in export("-o", "a.spz")
+    assert (load_spz("a.spz").means[:, 1] - load_ply("a.ply").means[:, 1]).abs().max() < 2e-5
     export("-o", "a.glb")
     assert glb_provenance("a.glb")["photos"] == "none"
     assert "85 frames" in export("-o", "a.html")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drjit_splat import load_ply, rasterization
+from drjit_splat import load_ply, load_spz, rasterization
 from tests.avatars import painted_avatar
 from tests.heads import sphere_head
 from uika import Avatar, HeadModel, UikaError, get_motion, neutral_camera, render
@@ -27,6 +27,7 @@ from uika.export import (
     write_ply,
     write_ply_sequence,
     write_splat,
+    write_spz,
 )
 from uika.export.ply import triangle_frames
 from uika.head import HeadParameters, pose_gaussians
@@ -72,12 +73,13 @@ def _picture(avatar: Avatar, splats: Splats) -> Tensor:
 
 
 def _from_ply(path: Path) -> Splats:
-    file = load_ply(path)
+    file = load_spz(path) if path.suffix == ".spz" else load_ply(path)
     return Splats(file.means, file.quats, file.scales, file.opacities, file.colors)
 
 
 @pytest.mark.parametrize(
-    ("kind", "decibels", "largest"), [("ply", 90, 1e-4), ("splat", 45, 0.05), ("glb", 90, 1e-4), ("npz", 90, 1e-4)]
+    ("kind", "decibels", "largest"),
+    [("ply", 90, 1e-4), ("splat", 45, 0.05), ("spz", 40, 0.1), ("glb", 90, 1e-4), ("npz", 90, 1e-4)],
 )
 def test_read_back_and_rendered_again(avatar, head, motion, tmp_path, kind, decibels, largest):
     params = motion.parameters(avatar.identity)[60]
@@ -89,6 +91,9 @@ def test_read_back_and_rendered_again(avatar, head, motion, tmp_path, kind, deci
     elif kind == "splat":
         write_splat(path, splats.half_turned())
         found = read_splat(path).half_turned()
+    elif kind == "spz":
+        write_spz(path, splats)
+        found = _from_ply(path).turned_over()
     elif kind == "glb":
         write_glb(path, splats, avatar.provenance)
         found = read_glb(path)

@@ -24,10 +24,10 @@ from tests.served import served
 from tools.setup_node import FOLDER
 from uika import Avatar, HeadModel, HeadParameters, Motion, UikaError, get_motion, load_head, neutral_camera, render
 from uika.export import write_obj, write_rigged_glb
-from uika.export.glb import read_parts
 from uika.export.texture import bake_texture, uv_tiles
 from uika.head import pose_vertices, rest_joints
 from uika.head.actions import ARKIT_ACTIONS
+from uika.io.glb import read_parts
 from uika.metrics import psnr
 from uika.motion.presets import expression_vector
 

@@ -14,8 +14,8 @@ from tests.served import served
 from tools.setup_node import FOLDER
 from uika import UikaError, load_head
 from uika.export import write_vrm
-from uika.export.glb import read_parts
 from uika.head.actions import ARKIT_ACTIONS
+from uika.io.glb import read_parts
 
 MODULES = FOLDER / "node_modules"
 DEMANDED = {"hips", "spine", "head"} | {

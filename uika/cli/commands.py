@@ -11,6 +11,7 @@ from uika.cli.export import Export
 from uika.cli.head import Head
 from uika.cli.reconstruct import Reconstruct
 from uika.cli.render import Render
+from uika.cli.sign import Sign
 from uika.cli.study import Study
 from uika.cli.synthesize import Synthesize
 from uika.cli.track import Track
@@ -27,6 +28,7 @@ Command = (
     | View
     | Export
     | Verify
+    | Sign
     | Demo
     | Head
     | Train

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from uika.head import HeadModel
     from uika.motion import Motion
 
-_KINDS = (".ply", ".splat", ".glb", ".obj", ".vrm", ".html", ".npz")
-_POSED = (".ply", ".splat", ".glb", ".obj")  # hold one pose
+_KINDS = (".ply", ".splat", ".spz", ".glb", ".obj", ".vrm", ".html", ".npz")
+_POSED = (".ply", ".splat", ".spz", ".glb", ".obj")  # hold one pose
 _LARGEST = 8192  # texels; more than most graphics cards hold
 _TURNED = (".ply", ".splat", "")
 
@@ -32,11 +32,11 @@ class Export:
     avatar: Positional[Path]
     """The avatar file."""
     output: Annotated[Path, arg(aliases=["-o"])]
-    """.ply, .splat, .glb, .obj, .vrm, .html, .npz, or a folder."""
+    """.ply, .splat, .spz, .glb, .obj, .vrm, .html, .npz, or a folder."""
     motion: str | None = None
     """orbit, talk, expressions or a motion file; an .html plays talk if left out."""
     frame: int | None = None
-    """Frame of the motion that .ply, .splat, .glb and .obj show; without it they are canonical."""
+    """Frame of the motion that .ply, .splat, .spz, .glb and .obj show; without it they are canonical."""
     mesh: bool = False
     """Write a .glb with a textured, rigged mesh instead of Gaussians; --motion becomes its animation."""
     texture: int = 1024
@@ -90,7 +90,7 @@ class Export:
         if not 16 <= self.texture <= _LARGEST:
             raise UikaError(f"--texture must lie between 16 and {_LARGEST}, not {self.texture}")
         if self.frame is not None and (self.motion is None or kind not in _POSED):
-            raise UikaError("--frame needs --motion and a .ply, .splat, .glb or .obj to write")
+            raise UikaError(f"--frame needs --motion and one of {', '.join(_POSED)} to write")
         if self.motion is not None and self.frame is None and kind in _POSED and not self.mesh:
             raise UikaError(f"{self.output}: holds one pose; add --frame, or name a folder for all of the motion")
         if self.with_binding and (kind != ".ply" or self.motion is not None):
@@ -136,6 +136,9 @@ class Export:
         splats = export.posed_splats(avatar, head, params)
         if kind == ".glb":
             export.write_glb(self.output, splats, avatar.provenance)
+            return ", Y up"
+        if kind == ".spz":
+            export.write_spz(self.output, splats)
             return ", Y up"
         turned = splats.half_turned() if down else splats
         if kind == ".splat":

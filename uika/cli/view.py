@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
@@ -37,6 +37,8 @@ class View:
     """What is framed: the portrait with its shoulders, or the head alone."""
     watermark: bool = True
     """Mark the pictures that the page renders."""
+    virtual_camera: bool = False
+    """Also show the avatar as a camera that other programs can choose; needs the package pyvirtualcam."""
 
     def run(self) -> int:
         """Serve until interrupted."""
@@ -51,7 +53,7 @@ class View:
         from uika.export import thinned
         from uika.head import load_head
         from uika.motion.presets import get_motion
-        from uika.viewer import CameraFace, LiveLinkFace, Viewer
+        from uika.viewer import CameraFace, LiveLinkFace, Viewer, VirtualCamera
 
         avatar, head = Avatar.load(self.avatar), load_head()
         avatar.check_head(head)
@@ -69,9 +71,11 @@ class View:
         if self.live_link is not None:
             camera = LiveLinkFace(head, self.live_link, self.listen)
             print(f"listening for Live Link Face on {':'.join(map(str, camera.place))} (UDP)", flush=True)
-        with Viewer(
-            avatar, head, motion, self.port, camera=camera, frame=self.frame, watermark=self.watermark
-        ) as viewer:
+        shown = VirtualCamera(avatar, self.frame, watermark=self.watermark) if self.virtual_camera else None
+        if shown is not None:
+            print(f"the avatar is the camera {shown.name}", flush=True)
+        options: dict[str, Any] = {"camera": camera, "frame": self.frame, "virtual_camera": shown}
+        with Viewer(avatar, head, motion, self.port, watermark=self.watermark, **options) as viewer:
             print(f"open {viewer.url} in a browser; Ctrl-C ends", flush=True)
             while True:
                 time.sleep(1.0)

@@ -7,6 +7,7 @@ from uika.export.obj import write_obj
 from uika.export.ply import write_bound_ply, write_ply, write_ply_sequence
 from uika.export.rigged import write_rigged_glb
 from uika.export.splats import Splats, posed_splats, thinned
+from uika.export.spz import write_spz
 from uika.export.tables import write_npz
 from uika.export.vrm import write_vrm
 
@@ -27,5 +28,6 @@ __all__ = [
     "write_ply_sequence",
     "write_rigged_glb",
     "write_splat",
+    "write_spz",
     "write_vrm",
 ]

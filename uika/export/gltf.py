@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from drjit_splat.constants import SH_C0
 from uika.errors import UikaError
-from uika.export.glb import FLOAT, VERTICES, WIDTHS, Glb, read_parts
 from uika.export.splats import Splats
 from uika.io.files import check_output
+from uika.io.glb import VERTICES, Glb, read_accessor, read_parts
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0  # mode of a primitive
@@ -86,7 +85,7 @@ def read_glb(path: str | Path) -> Splats:
         if primitive is None:
             raise UikaError(f"{source}: holds no Gaussians ({EXTENSION})")
         read = {
-            key: torch.from_numpy(_accessor(document, binary, primitive["attributes"][name]))
+            key: torch.from_numpy(read_accessor(document, binary, primitive["attributes"][name]))
             for key, name in _NAMES.items()
         }
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -107,23 +106,3 @@ def glb_provenance(path: str | Path) -> dict[str, str]:
     extras = asset.get("extras") if isinstance(asset, dict) else None
     found = extras.get("provenance") if isinstance(extras, dict) else None
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
-
-
-def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:
-    """Rows [N,C] of one float accessor."""
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    if accessor["componentType"] != FLOAT:
-        raise ValueError("an attribute is not stored as floats")
-    width = WIDTHS[accessor["type"]]
-    inside, stride = accessor.get("byteOffset", 0), view.get("byteStride", 4 * width)
-    start, count = view.get("byteOffset", 0) + inside, accessor["count"]
-    end = stride * (count - 1) + 4 * width
-    if min(start, inside, count) < 0 or stride < 4 * width or inside + end > view["byteLength"]:
-        raise ValueError("an attribute does not fit its buffer view")
-    if start + end > len(binary):
-        raise ValueError("an attribute reaches beyond the end of the data")
-    rows = np.ndarray((count, width), "<f4", binary, start, (stride, 4))
-    if not np.isfinite(rows).all():
-        raise ValueError("an attribute holds values that are not finite")
-    return rows.copy()

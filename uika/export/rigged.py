@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.avatar import Avatar
-from uika.export.glb import INDICES, VERTICES, Glb
 from uika.export.mesh import SkinnedMesh, skinned_mesh
 from uika.export.texture import SIZE, as_png, bake_texture
 from uika.head import HeadModel
 from uika.head.model import JOINT_NAMES, JOINT_PARENTS
 from uika.io.files import check_output
+from uika.io.glb import INDICES, VERTICES, Glb
 from uika.motion import Motion
 
 UNLIT = "KHR_materials_unlit"  # the texture holds the photos' own light

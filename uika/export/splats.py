@@ -33,6 +33,12 @@ class Splats:
         means = self.means * self.means.new_tensor([-1.0, -1.0, 1.0])
         return dataclasses.replace(self, means=means, quats=torch.stack((-z, -y, x, w), -1))
 
+    def turned_over(self) -> Splats:
+        """Turned by 180 degrees about X: from right, up, back to right, down, forward and back."""
+        w, x, y, z = self.quats.unbind(-1)
+        means = self.means * self.means.new_tensor([1.0, -1.0, -1.0])
+        return dataclasses.replace(self, means=means, quats=torch.stack((-x, w, -z, y), -1))
+
 
 def posed_splats(avatar: Avatar, head: HeadModel, params: HeadParameters | None = None) -> Splats:
     """An avatar's Gaussians in head space (Y up).

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from uika.avatar import Avatar
-from uika.export.glb import Glb
 from uika.export.mesh import SkinnedMesh, skinned_mesh
 from uika.export.rigged import MESH_NODE, add_mesh
 from uika.export.texture import SIZE, bake_texture
 from uika.head import HeadModel
 from uika.io.files import check_output
+from uika.io.glb import Glb
+from uika.motion.vrm_expressions import PRESETS, actions_of
 
 EXTENSION = "VRMC_vrm"
 _LICENCE = "https://vrm.dev/licenses/1.0/"  # what the specification demands here
@@ -35,26 +36,6 @@ _BODY: dict[str, tuple[str | None, tuple[float, float, float]]] = {
     "rightHand": ("rightLowerArm", (-0.25, 0.0, 0.0)),
 }
 _NECK = (0.0, 0.38, 0.0)  # of the head's root from the spine
-# VRM's expressions in ARKit's; a name without side stands for both sides.
-_PRESETS: dict[str, dict[str, float]] = {
-    "happy": {"mouthSmile": 0.8, "cheekSquint": 0.4},
-    "angry": {"browDown": 0.9, "noseSneer": 0.4, "mouthPress": 0.3},
-    "sad": {"browInnerUp": 0.8, "mouthFrown": 0.7},
-    "relaxed": {"mouthSmile": 0.3, "eyeSquint": 0.3},
-    "surprised": {"browInnerUp": 0.8, "browOuterUp": 0.8, "eyeWide": 0.7, "jawOpen": 0.4},
-    "aa": {"jawOpen": 0.6},
-    "ih": {"jawOpen": 0.2, "mouthStretch": 0.5, "mouthSmile": 0.2},
-    "ou": {"jawOpen": 0.15, "mouthPucker": 0.8},
-    "ee": {"jawOpen": 0.25, "mouthSmile": 0.4, "mouthStretch": 0.3},
-    "oh": {"jawOpen": 0.4, "mouthFunnel": 0.6},
-    "blink": {"eyeBlink": 1.0},
-    "blinkLeft": {"eyeBlinkLeft": 1.0},
-    "blinkRight": {"eyeBlinkRight": 1.0},
-    "lookUp": {"eyeLookUp": 1.0},
-    "lookDown": {"eyeLookDown": 1.0},
-    "lookLeft": {"eyeLookOutLeft": 1.0, "eyeLookInRight": 1.0},
-    "lookRight": {"eyeLookInLeft": 1.0, "eyeLookOutRight": 1.0},
-}
 
 
 def write_vrm(path: str | Path, avatar: Avatar, head: HeadModel, name: str = "avatar", size: int = SIZE) -> SkinnedMesh:
@@ -82,7 +63,7 @@ def write_vrm(path: str | Path, avatar: Avatar, head: HeadModel, name: str = "av
     add_mesh(file, mesh, [bake_texture(avatar, head, tile, size) for tile in mesh.faces])
     bones = {**_OWN_BONES, **_add_body(file)}
     expressions = {
-        "preset": _expressions(mesh, _PRESETS),
+        "preset": _expressions(mesh, {name: actions_of(name, mesh.morphs) for name in PRESETS}),
         "custom": _expressions(mesh, {m: {m: 1.0} for m in mesh.morphs}),
     }
     file.document["extensions"] = {
@@ -122,10 +103,7 @@ def _expressions(mesh: SkinnedMesh, wanted: dict[str, dict[str, float]]) -> dict
     order, found = list(mesh.morphs), {}
     for name, actions in wanted.items():
         binds = [
-            {"node": MESH_NODE, "index": order.index(full), "weight": weight}
-            for action, weight in actions.items()
-            for full in (action, f"{action}Left", f"{action}Right")
-            if full in order
+            {"node": MESH_NODE, "index": order.index(action), "weight": weight} for action, weight in actions.items()
         ]
         if binds:
             found[name] = {"morphTargetBinds": binds, "isBinary": False}

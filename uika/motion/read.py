@@ -14,16 +14,18 @@ from uika.motion.arkit import read_csv, read_json
 from uika.motion.bvh import read_bvh
 from uika.motion.flame import is_flame_params, read_flame_params
 from uika.motion.motion import Motion, MotionError, load_motion
+from uika.motion.vrm_animation import read_vrma
 
-KINDS = (".npz", ".csv", ".json", ".bvh")
+KINDS = (".npz", ".csv", ".json", ".bvh", ".vrma")
 
 
 def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = None) -> Motion:
     """Read a motion of any known kind for `head`.
 
     Known are our own `.npz`; FLAME parameters, one `.npz` with `expr` [T,E] or a folder with one for each frame; ARKit
-    `.csv` (Live Link Face) and `.json` (named activations); `.bvh`, whose head turns and has no
-    expressions. Expressions of another kind than the head's are transferred with `uika.motion.retargeting`.
+    `.csv` (Live Link Face) and `.json` (named activations); `.vrma`, animations of VRM avatars; `.bvh`, whose head
+    turns and has no expressions. Expressions of another kind than the head's are transferred with
+    `uika.motion.retargeting`.
 
     Args:
         path: file or folder.
@@ -44,6 +46,8 @@ def read_motion(path: str | Path, head: HeadModel, source: HeadModel | None = No
         return for_head(read_json(place), head)
     if place.suffix.lower() == ".bvh":
         return for_head(read_bvh(place), head)
+    if place.suffix.lower() == ".vrma":
+        return for_head(read_vrma(place), head)
     raise MotionError(f"{place}: is no motion; known are {', '.join(KINDS)} and folders of FLAME parameters")
 
 

@@ -5,5 +5,6 @@ from uika.viewer.controls import Controls
 from uika.viewer.live import LiveSplats
 from uika.viewer.live_link import LiveLinkFace
 from uika.viewer.page import Viewer
+from uika.viewer.virtual_camera import VirtualCamera
 
-__all__ = ["CameraFace", "Controls", "LiveLinkFace", "LiveSplats", "Viewer"]
+__all__ = ["CameraFace", "Controls", "LiveLinkFace", "LiveSplats", "Viewer", "VirtualCamera"]

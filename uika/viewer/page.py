@@ -24,6 +24,7 @@ from uika.viewer.painting import Painting
 from uika.viewer.panels import IdentityPanel, MotionPanel, PosePanel
 from uika.viewer.sending import KINDS, exported
 from uika.viewer.still import camera_of, compare
+from uika.viewer.virtual_camera import VirtualCamera
 
 _FOV = 20.0  # degrees
 _PRESETS = {"Front": (0.0, 0.0), "Left": (60.0, 0.0), "Right": (-60.0, 0.0), "Above": (0.0, 50.0), "Back": (180.0, 0.0)}
@@ -45,6 +46,7 @@ class Viewer:
         camera: LiveFace | None = None,
         frame: Framing = "bust",
         watermark: bool = True,
+        virtual_camera: VirtualCamera | None = None,
     ) -> None:
         """Start the server on 127.0.0.1.
 
@@ -56,6 +58,7 @@ class Viewer:
             camera: whose face the avatar follows; it is stopped with the page.
             frame: what the page's own views show, as in `uika.neutral_camera`.
             watermark: whether pictures that the page renders are marked.
+            virtual_camera: where the avatar is also shown; it is stopped with the page.
 
         Raises:
             AvatarError: the head model is another one.
@@ -71,6 +74,7 @@ class Viewer:
         self._motion = get_motion("talk", head) if motion is None else motion
         self.live = LiveSplats(avatar, head)
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label="avatar", verbose=False)
+        self._virtual = virtual_camera
         self.updates = 0  # poses sent so far
         self._mesh: Any = None
         self._dirty, self._reshaped, self._stopped = threading.Event(), threading.Event(), threading.Event()
@@ -92,6 +96,8 @@ class Viewer:
         self._thread.join(30)
         if self._camera is not None:
             self._camera.stop()
+        if self._virtual is not None:
+            self._virtual.stop()
         self.server.stop()
 
     def __enter__(self) -> Viewer:
@@ -183,10 +189,14 @@ class Viewer:
         filmed = None if camera is None else camera.newest()
         if filmed is not None or self._playing.advance():
             self._dirty.set()
+        if self._virtual is not None:
+            self._virtual.keep()
         if not self._dirty.is_set():
             return False
         self._dirty.clear()
         self._params = self._wanted() if filmed is None else filmed
+        if self._virtual is not None:
+            self._virtual.show(self.live, self._params)
         if self._painting.here:
             self._painting.show(self.live, self._params)
         if not self._painting.here or self._mesh is not None:

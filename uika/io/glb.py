@@ -87,7 +87,7 @@ def read_parts(path: Path) -> tuple[dict[str, Any], bytes]:
         UikaError: no such file, or it is damaged.
     """
     if not path.is_file():
-        raise UikaError(f"{path}: no such .glb file")
+        raise UikaError(f"{path}: no such file")
     data = path.read_bytes()
     try:
         magic, version, length = struct.unpack_from("<III", data)
@@ -100,3 +100,28 @@ def read_parts(path: Path) -> tuple[dict[str, Any], bytes]:
     except (struct.error, ValueError, RecursionError) as error:
         raise UikaError(f"{path}: is damaged or no .glb file ({error})") from error
     return document, data[20 + size + 8 :]
+
+
+def read_accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np.float32]:
+    """Rows [N,C] of one float accessor.
+
+    Raises:
+        ValueError: it does not lie inside the data, is not stored as floats, or holds values that are not finite.
+        KeyError, IndexError, TypeError: the document lacks what an accessor needs.
+    """
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    if accessor["componentType"] != FLOAT:
+        raise ValueError("an attribute is not stored as floats")
+    width = WIDTHS[accessor["type"]]
+    inside, stride = accessor.get("byteOffset", 0), view.get("byteStride", 4 * width)
+    start, count = view.get("byteOffset", 0) + inside, accessor["count"]
+    end = stride * (count - 1) + 4 * width
+    if min(start, inside, count) < 0 or stride < 4 * width or inside + end > view["byteLength"]:
+        raise ValueError("an attribute does not fit its buffer view")
+    if start + end > len(binary):
+        raise ValueError("an attribute reaches beyond the end of the data")
+    rows = np.ndarray((count, width), "<f4", binary, start, (stride, 4))
+    if not np.isfinite(rows).all():
+        raise ValueError("an attribute holds values that are not finite")
+    return rows.copy()
