@@ -18,7 +18,7 @@ PACKAGES: dict[str, set[str]] = {
     "uika.io": set(),
     "uika.photo": {"uika.io", "uika.assets"},
     "uika.uv": set(),
-    "uika.metrics": {"uika.io", "uika.head", "uika.photo", "uika.fitting"},
+    "uika.metrics": {"uika.io", "uika.assets", "uika.head", "uika.photo", "uika.fitting"},
     "uika.head": {"uika.io", "uika.assets"},
     "uika.head_import": {"uika.head", "uika.io", "uika.photo"},
     "uika.fitting": {"uika.head", "uika.photo", "uika.io", "uika.assets"},

@@ -23,6 +23,7 @@ from uika.evaluate.sequences import choose_frames
 from uika.head import load_head
 from uika.io.video import write_png
 from uika.metrics.arcface import SIDE
+from uika.metrics.face_descriptor import SAME
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def test_more_views_and_good_scores(settings: Evaluation) -> None:
     assert values["SSIM"][1] > values["SSIM"][0] > 0.6  # type: ignore[operator]
     assert values["FLIP"][1] < values["FLIP"][0] < 0.3  # type: ignore[operator]
     assert values["FLIP masked"][1] > values["FLIP"][1]  # type: ignore[operator]
-    for name in ("AED", "APD", "AKD"):
+    for name in ("face distance", "AED", "APD", "AKD"):
         assert all(value is not None and value > 0 for value in values[name])
     assert values["LPIPS"] == values["CSIM"] == [None, None]
 
@@ -169,9 +170,10 @@ def test_a_system_that_copies_the_driver_has_its_expression(settings: Evaluation
     evaluate(theirs)
     write_report(theirs.output)
     (section,) = gather(theirs.output)
-    assert [metric.name for metric in section.metrics] == ["CSIM", "AED", "APD", "AKD"]
-    csim, *others = [section.rows[0].value(metric) for metric in section.metrics]
-    assert csim is None and others == pytest.approx([0, 0, 0], abs=1e-9)
+    assert [metric.name for metric in section.metrics] == ["CSIM", "face distance", "AED", "APD", "AKD"]
+    csim, distance, *others = [section.rows[0].value(metric) for metric in section.metrics]
+    assert csim is None and distance is not None and distance > SAME, "the driver is another person"
+    assert others == pytest.approx([0, 0, 0], abs=1e-9)
     assert [result.driver for result in section.rows[0].results] == ["000001", "000000"]
 
 

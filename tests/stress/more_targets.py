@@ -15,9 +15,12 @@ from PIL import Image
 
 from drjit_splat.cli import load_camera
 from tests.drjit_splat.common import random_scene
+from tests.vrm_animations import written
 from uika.export import Splats, read_glb, read_splat, write_glb, write_splat
 from uika.io.video import write_video
 from uika.model import PRESETS, CheckpointError, Reconstructor, load_checkpoint, save_checkpoint
+from uika.motion import MotionError
+from uika.motion.vrm_animation import read_vrma
 from uika.safeguards import verify
 from uika.tracking.decode import VideoError, decode, frame_rate
 
@@ -115,6 +118,7 @@ TARGETS: dict[str, tuple[Callable[[Path], list[Path]], mutate.Mutator, Callable[
     "verify_video": (_videos, mutate.blind, verify, ValueError),
     "verify_export": (_exports, _glb_damage, verify, ValueError),
     "glb": (_glb, _glb_damage, read_glb, ValueError),
+    "vrma": (lambda folder: [written(folder / "a.vrma")], _glb_damage, read_vrma, MotionError),
     "splat": (_splat, mutate.blind, read_splat, ValueError),
     "model": (_models, mutate.safetensors, load_checkpoint, CheckpointError),
     "camera": (_cameras, mutate.text, load_camera, ValueError),

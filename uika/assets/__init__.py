@@ -6,6 +6,7 @@ _FOLDER = Path(__file__).resolve().parent
 PORTRAIT = _FOLDER / "portrait.jpg"
 HEAD = _FOLDER / "head.npz"
 BUST = _FOLDER / "bust.npz"
+FACE_DESCRIPTOR = _FOLDER / "face_descriptor.safetensors"
 TINY_WEIGHTS = _FOLDER / "tiny.safetensors"
 CORRESPONDENCE_WEIGHTS = _FOLDER / "correspondence.safetensors"
 FACE_MODELS = _FOLDER / "face"

@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict, dataclass
 
 TURNED_AWAY = 0.25  # cosine between face and camera below which a source would not show the face
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ METRICS = (
     Metric("SSIM masked", True, 3, False),
     Metric("FLIP masked", False, 3, False),
     Metric("CSIM", True, 3, True, "arcface"),
+    Metric("face distance", False, 3, True),
     Metric("AED", False, 4, True),
     Metric("APD", False, 4, True),
     Metric("AKD", False, 2, True),
@@ -93,7 +94,10 @@ class Protocol:
             "AED: mean difference of activations, APD: angle in radians between head rotations, both of head fits to "
             f"the detected landmarks (head model {self.head}); AKD: pixels at 512, 478 face mesh landmarks",
             "CSIM: " + ("against the truth" if self.task == "self" else "against the first source"),
-            "frames in which the detector finds no face in truth or result do not count for CSIM, AED, APD and AKD; "
+            "face distance: between descriptors of dlib's free network, of the same pair; below 0.6 its author takes "
+            "two pictures for one person; no CSIM, and not to be compared with any",
+            "frames in which the detector finds no face in truth or result do not count for CSIM, face distance, AED, "
+            "APD and AKD; "
             "the column 'faces' says how many did",
         ]
         if self.correspondence:

@@ -179,11 +179,12 @@ class _Run:
         else:
             avatar, seconds = self._made(sequence, views, plan.settings.correspondence)
             images = drive(avatar, truth.views, judges.head, protocol.background)
+        crossed = protocol.task == "cross"
         # Between two people a result's face counts without one in the truth.
-        results = Pictures.of(images, None if judges.arcface is not None else truth.pictures)
+        results = Pictures.of(images, None if crossed else truth.pictures)
         (first,) = target_views([sequence.person.sample(sequence.sources[0])], protocol, judges.head)
         shown = truth_picture(first, protocol.background)
-        person = Pictures.of([shown] if judges.arcface is not None and protocol.task == "cross" else [])
+        person = Pictures.of([shown] if crossed else [])
         return Result(
             protocol=protocol.digest(),
             sequence=sequence.name,

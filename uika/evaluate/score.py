@@ -12,6 +12,7 @@ from uika.evaluate.protocol import Protocol
 from uika.head import HeadModel
 from uika.metrics import expression_distance, fit_faces, flip_map, keypoint_distance, pose_distance, psnr
 from uika.metrics.arcface import ArcFace, identity_similarity
+from uika.metrics.face_descriptor import face_distance
 from uika.metrics.faces import find_landmarks
 from uika.metrics.image import ssim_pixels
 from uika.metrics.lpips import Lpips
@@ -58,7 +59,7 @@ def score(
         results: T pictures to judge.
         truths: T pictures that they should look like, or whose expression and pose they should have.
         masks: T masks [S,S] bool of the person in the truths.
-        person: one picture of the person whom the results should show, for CSIM between persons.
+        person: one picture of the person whom the results should show, where it is not in the truths.
         protocol: says which metrics.
         judges: head and networks.
     """
@@ -70,12 +71,13 @@ def score(
     for index, values in _face_scores(results, truths, protocol, judges.head).items():
         for name, value in values.items():
             found[name][index] = value
-    if judges.arcface is not None:
-        for index, (image, marks) in enumerate(zip(results.images, results.landmarks, strict=True)):
-            model, place = (truths, index) if protocol.task == "self" else (person, 0)
-            other = model.landmarks[place]
-            if marks is not None and other is not None:
-                pair = (image, marks), (model.images[place], other)
+    for index, (image, marks) in enumerate(zip(results.images, results.landmarks, strict=True)):
+        model, place = (truths, index) if protocol.task == "self" else (person, 0)
+        other = model.landmarks[place]
+        if marks is not None and other is not None:
+            pair = (image, marks), (model.images[place], other)
+            found["face distance"][index] = face_distance(*pair)
+            if judges.arcface is not None:
                 found["CSIM"][index] = identity_similarity(judges.arcface, *pair)
     return found
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from uika.errors import UikaError
+from uika.metrics.alignment import aligned
 
 SIDE = 112  # pixels of an aligned face
 # Where ArcFace was trained to see the eyes, the nose and the corners of the mouth; left is the picture's left.
@@ -61,17 +62,4 @@ def identity_similarity(network: ArcFace, first: tuple[Tensor, Tensor], second: 
 
 def aligned_face(image: Tensor, landmarks: Tensor) -> Tensor:
     """The face [112,112,3] turned, scaled and moved to where ArcFace expects it; black beyond the picture."""
-    points = landmarks[[*_IRISES, _NOSE, *_MOUTH]].double()
-    places = torch.tensor(_PLACES, dtype=torch.float64)
-    # Least squares for the similarity that takes an aligned pixel to the picture: p = a q + b q' + t, q' = q turned.
-    turned = torch.stack((-places[:, 1], places[:, 0]), -1)
-    system = torch.zeros(len(places), 2, 4, dtype=torch.float64)
-    system[..., 0], system[..., 1] = places, turned
-    system[:, 0, 2] = system[:, 1, 3] = 1
-    a, b, x, y = torch.linalg.lstsq(system.reshape(-1, 4), points.reshape(-1, 1)).solution[:, 0]
-    centres = torch.arange(SIDE, dtype=torch.float64) + 0.5
-    row, column = torch.meshgrid(centres, centres, indexing="ij")
-    place = torch.stack((a * column - b * row + x, b * column + a * row + y), -1)
-    size = torch.tensor([image.shape[1], image.shape[0]], dtype=torch.float64)
-    grid = (2 * place / size - 1).to(image.dtype)[None]
-    return torch.nn.functional.grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)[0].permute(1, 2, 0)
+    return aligned(image, landmarks[[*_IRISES, _NOSE, *_MOUTH]], torch.tensor(_PLACES), SIDE)
