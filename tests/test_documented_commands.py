@@ -16,8 +16,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
 import drjit_splat.cli
+from tests.certificates import certified
 from tests.documented import PAGES, ROOT, examples, mentioned, scripted, shown
 from tests.drjit_splat.training.made_up import write_colmap
 from tests.exports import write_export
@@ -108,6 +110,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     view = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 256, "height": 256}
     (place / "cameras.json").write_text(json.dumps([view] * 4))
     write_colmap(place / "garden", binary=True)
+    certified(place, ec.generate_private_key(ec.SECP256R1()))
     return place
 
 
