@@ -29,20 +29,10 @@ _PLACES = (
 _MARKS = (263, 362, 33, 133, 2)  # of the face mesh, in that order
 _MARGIN = 0.25  # of the mean face's square, on each side
 _MEAN = (122.782, 117.001, 104.298)  # of the photos that it was trained with, 0 to 255
-_BLOCKS: tuple[str, ...] = (
-    "32_1",
-    "32_2",
-    "32_3",
-    "64_down",
-    "64_1",
-    "64_2",
-    "64_3",
-    "128_down",
-    "128_1",
-    "128_2",
-    "256_down",
+_BLOCKS = (
+    *("32_1", "32_2", "32_3", "64_down", "64_1", "64_2", "64_3"),
+    *("128_down", "128_1", "128_2", "256_down", "256_1", "256_2", "256_down_out"),
 )
-_BLOCKS += ("256_1", "256_2", "256_down_out")
 
 
 @torch.no_grad()
