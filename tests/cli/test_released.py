@@ -61,6 +61,21 @@ def test_the_command_gives_the_released_gaussians(folder: Path, avatar: Avatar) 
     assert avatar.provenance["model"] == "released (uika.safetensors)"
 
 
+def test_half_the_memory_gives_nearly_the_same(
+    folder: Path, avatar: Avatar, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--model", str(folder / "uika.safetensors"), "--head", str(folder / "flame.npz")]
+    given = [*words, "--precision", "bfloat16", "-o", str(folder / "half.safetensors")]
+    assert main(["reconstruct", str(PORTRAIT), *given]) == 0
+    half = Avatar.load(folder / "half.safetensors")
+    assert half.provenance["model"] == "released (uika.safetensors) in bfloat16"
+    assert 0 < float((half.means - avatar.means).abs().max()) < 3e-3
+    assert float((half.colors - avatar.colors).abs().mean()) < 0.01
+    none = ["--precision", "bfloat16", "-o", str(folder / "none.safetensors")]
+    assert main(["reconstruct", str(PORTRAIT), *none]) == 2
+    assert "--precision bfloat16: model 'tiny' is small and runs in float32" in sentence(capsys)
+
+
 def test_gaussians_are_moved_as_released(tmp_path: Path) -> None:
     """The authors' own numbers for points bound to a synthetic head, through the avatar's file."""
     data, head = released_parity()

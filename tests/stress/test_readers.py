@@ -109,6 +109,16 @@ def test_a_video_whose_comment_is_not_text(tmp_path: Path) -> None:
     assert len(list(decode(path))) == 4 and frame_rate(path) == 10
 
 
+def test_a_video_of_an_unknown_kind(tmp_path: Path) -> None:
+    path = _seed("phone_video", tmp_path)
+    data = path.read_bytes()
+    assert b"avc1" in data
+    path.write_bytes(data.replace(b"avc1", b"zzz9"))
+    for reader in (lambda p: list(decode(p)), frame_rate):
+        with pytest.raises(UikaError, match=r"phone\.mp4: has pictures of a kind that FFmpeg does not know"):
+            reader(path)
+
+
 def test_a_video_without_pictures(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"no video")
     with pytest.raises(UikaError, match=r"a\.mp4"):

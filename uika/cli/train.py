@@ -81,6 +81,8 @@ class Train:
             # Maps are much cheaper than pictures of Gaussians; the released training has the same proportions.
             config = replace(config, images=3 * config.images, items=2 * config.items)
         config = replace(config, **given)
+        if "images" in given:  # one head may not have more photos than a step has
+            config = replace(config, sources=min(config.sources, config.images))
         if self.overfit:
             # The same pictures at every step, which alone count, and full speed soon: this shows that gradients arrive.
             losses = replace(config.losses, atlas=0.0, relief=0.0)

@@ -20,6 +20,7 @@ from uika.io.files import check_folder, replacing
 PAGE, KEY, TABLE = "study.html", "study_key.json", "study_table.md"
 QUESTIONS = ("Render quality", "Motion consistency", "Identity preservation")
 LEAST, MOST = 1, 5
+_SCORES = [str(score) for score in range(LEAST, MOST + 1)]
 REFERENCE = "reference"  # the folder of what is shown beside the clips and not rated
 COLUMNS = ("participant", "clip", "shown", "question", "score")
 _KINDS = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".jpg": "image/jpeg", ".gif": "image/gif"}
@@ -100,8 +101,8 @@ def read_answers(answers: Sequence[str | Path], key: str | Path) -> list[Rating]
             where = f"{path}: line {line}"
             if row["shown"] not in known or row["question"] not in QUESTIONS:
                 raise UikaError(f"{where} is of another study; give the key of its own")
-            if not row["score"].isdecimal() or not LEAST <= int(row["score"]) <= MOST:
-                raise UikaError(f"{where}: the score must be {LEAST} to {MOST}, not '{row['score']}'")
+            if row["score"] not in _SCORES:
+                raise UikaError(f"{where}: the score must be {LEAST} to {MOST}, not '{row['score'][:20]}'")
             place = (row["participant"], row["shown"], row["question"])
             if place in seen:
                 raise UikaError(f"{where}: participant '{row['participant']}' answered before; give each file once")

@@ -65,12 +65,13 @@ def read_sound(path: str | Path) -> Sound:
         raise
     except (av.FFmpegError, OSError, ValueError) as error:
         raise UikaError(f"{source}: cannot be read as sound ({error})") from error
-    samples = np.concatenate(parts) if parts else np.zeros(0, np.float32)
+    samples = np.concatenate(parts, dtype=np.float32) if parts else np.zeros(0, np.float32)
+    parts.clear()
     if not len(samples):
         raise UikaError(f"{source}: holds no sound")
     if not np.isfinite(samples).all():
         raise UikaError(f"{source}: holds sound that is not finite")
-    return Sound(samples.astype(np.float32).clip(-1, 1))
+    return Sound(samples.clip(-1, 1, out=samples))
 
 
 class SoundTrack:

@@ -15,7 +15,7 @@ from uika.model.config import (
 from uika.model.estimator import Estimator
 from uika.model.gaussians import CanonicalGaussians
 from uika.model.observation import Observation
-from uika.model.precision import compile_blocks, computes_bfloat16
+from uika.model.precision import Precision, compile_blocks, computes_bfloat16
 from uika.model.reconstructor import Reconstructor
 from uika.model.session import Session
 from uika.model.view_features import FeatureCache, Keep, ViewFeatures
@@ -33,6 +33,7 @@ __all__ = [
     "Keep",
     "ModelConfig",
     "Observation",
+    "Precision",
     "Reconstructor",
     "Session",
     "SurfaceTexels",

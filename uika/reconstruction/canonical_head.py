@@ -108,10 +108,12 @@ class CanonicalHead:
     def _located(self, fit: Fit | None, images: Tensor, mattes: Tensor) -> tuple[Tensor, Tensor]:
         """UV maps [1,N,2,S,S], NaN where a pixel shows no part of the head, and the trust [N,S,S] in them."""
         from uika.fitting import pixel_uv
+        from uika.model.precision import arithmetic
         from uika.reconstruction.estimated_pixels import consent, estimated_pixels
 
         if self._loaded.estimator is not None and self._loaded.correspondence == "network":
-            return estimated_pixels(self._loaded.estimator, images, mattes)
+            with arithmetic(self._loaded.network.precision, images.device):
+                return estimated_pixels(self._loaded.estimator, images, mattes)
         assert fit is not None  # LoadedModel.needs_fit
         uv, valid, weight = pixel_uv(fit, self._head, mattes)
         uv = torch.where(valid[..., None], uv, torch.nan).permute(0, 3, 1, 2)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from uika.head import Binding, HeadModel
-    from uika.model import Reconstructor
+    from uika.model import Precision, Reconstructor
     from uika.model.estimator_file import AnyEstimator
     from uika.model.released import ReleasedModel
     from uika.model.surface_estimator import SurfaceEstimator
@@ -76,6 +76,7 @@ def check_model(
     estimator: str | Path | None = None,
     backbone: str | Path | None = None,
     correspondence: Correspondence | None = None,
+    precision: Precision = "float32",
 ) -> None:
     """Refuse files that `reconstruct` could not use, from their headers, before other work starts.
 
@@ -100,6 +101,8 @@ def check_model(
                 f"--backbone {backbone}: model '{model}' brings its own backbone; only released weights take another"
             )
         check_kind(backbone, ("backbone",))
+    if precision != "float32" and kind != "released model":
+        raise UikaError(f"--precision {precision}: model '{model}' is small and runs in float32; leave it out")
 
 
 def load_model(
@@ -107,8 +110,9 @@ def load_model(
     estimator: str | Path | None = None,
     backbone: str | Path | None = None,
     correspondence: Correspondence | None = None,
+    precision: Precision = "float32",
 ) -> LoadedModel:
-    """The model of a name or file that `reconstruct` takes.
+    """The model of a name or file that `reconstruct` takes; `precision` is that of released weights.
 
     `correspondence` None stands for "network" with an estimator's file, else for the default; without a file, "network"
     and "both" take the estimator that comes with the program.
@@ -116,17 +120,20 @@ def load_model(
     Raises:
         ValueError: a name or file cannot be used.
     """
+    import torch
+
     from uika.model import build, load_checkpoint
     from uika.model.estimator_file import read_estimator
     from uika.model.surface_estimator import SurfaceEstimator
     from uika.model.weight_kind import weight_kind
 
-    check_model(model, estimator, backbone, correspondence)
+    check_model(model, estimator, backbone, correspondence, precision)
     if str(model) not in _NAMES and weight_kind(model) == "released model":
         from uika.model import released
 
-        whole = released.load(model, estimator=estimator, backbone=backbone)
-        name = f"released ({Path(model).name})"
+        kind = torch.bfloat16 if precision == "bfloat16" else torch.float32
+        whole = released.load(model, dtype=kind, estimator=estimator, backbone=backbone)
+        name = f"released ({Path(model).name})" + (f" in {precision}" if precision != "float32" else "")
         return LoadedModel(whole.network, name, True, whole.estimator, whole, "network")
     way = correspondence or ("network" if estimator is not None else DEFAULT_CORRESPONDENCE)
     located = None if way == "fit" else read_estimator(estimator or CORRESPONDENCE_WEIGHTS)

@@ -24,7 +24,7 @@ from uika.reconstruction.report import Report
 
 if TYPE_CHECKING:
     from uika.fitting import Fit
-    from uika.model import Keep
+    from uika.model import Keep, Precision
     from uika.photo import Photo
 
 MAX_PHOTOS = 64
@@ -48,6 +48,7 @@ def reconstruct(
     estimator: str | Path | None = None,
     backbone: str | Path | None = None,
     correspondence: Correspondence | None = None,
+    precision: Precision = "float32",
     refine: bool = True,
     keep: Keep = "all",
     photo_splats: bool = True,
@@ -68,6 +69,8 @@ def reconstruct(
         correspondence: what says what each pixel shows: "fit", the fitted head; "network", an estimator, the built-in
             one where no other is given; "both", the fitted head, in whose fit an estimator had a say. None stands for
             "network" where `estimator` is given, else for the default.
+        precision: of released weights; "bfloat16" takes half the memory and, where the processor computes it, a part of
+            the time, for nearly the same avatar.
         refine: whether to refine the fit with the colours that two or more photos share.
         keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
         photo_splats: whether to add splats for what the photos show outside the fitted surface; a model whose Gaussians
@@ -83,7 +86,7 @@ def reconstruct(
         raise UikaError(f"give 1 to {MAX_PHOTOS} photos of one person, not {len(photos)}")
     report = Report() if report is None else report
     with report.stage("model"):
-        loaded = load_model(model, estimator, backbone, correspondence)
+        loaded = load_model(model, estimator, backbone, correspondence, precision)
         head = load_head() if head is None else head
         check_loaded(loaded, head, estimator)
     alone, bust = head.without_bust, loaded.takes_bust(head)

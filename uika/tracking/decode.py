@@ -80,7 +80,9 @@ def decode(path: Path, colour: bool = False) -> Iterator[VideoFrame]:
 
 def _moving(path: Path, container: Any) -> Any:
     """The stream of moving pictures; covers of songs and films are still ones that FFmpeg lists among them."""
-    moving = [stream for stream in container.streams.video if not _is_cover(stream)]
+    if container.streams.video and all(stream.codec_context is None for stream in container.streams.video):
+        raise VideoError(f"{path}: has pictures of a kind that FFmpeg does not know here; convert it to H.264")
+    moving = [each for each in container.streams.video if each.codec_context is not None and not _is_cover(each)]
     if not moving:
         covers = " besides its cover" if container.streams.video else ""
         raise VideoError(f"{path}: has no moving pictures in it{covers}")
