@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from drjit_splat.cli import load_camera
+from tests.flame_files import flame_arrays
 from uika.errors import UikaError
 from uika.export import glb_provenance, html_provenance, read_glb
 from uika.head import HeadError
@@ -163,6 +164,14 @@ def test_torch_files_of_old_are_called_that(tmp_path: Path) -> None:
     torch.save({"v_template": torch.zeros(3)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
     with pytest.raises(HeadError, match=r"a\.pt: is a PyTorch file"):
         read_flame(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("line", ["vt 0.5", "vt", f"f 1/1 1/1 {10**30}/1", "f 1/1 1/1 1/"])
+def test_meshes_with_damaged_lines(line: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "m.npz", **flame_arrays())
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nvt 0.5 0.5\nf 1/1 1/1 1/1\n{line}\n")
+    with pytest.raises(HeadError, match=r"a\.obj: a line is damaged"):
+        read_flame(tmp_path / "m.npz", tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize("mask", [np.zeros(0, np.int64), np.array(2), np.array([[0, 1]])])

@@ -196,7 +196,7 @@ def _read_obj(path: Path) -> tuple[Tensor, Tensor, Tensor]:
             if key == "v":
                 vertices += 1
             elif key == "vt":
-                uvs.append([float(word) for word in words[:2]])
+                uvs.append([float(words[0]), float(words[1])])
             elif key == "f":
                 corners = [word.split("/") for word in words]
                 points = [_index(corner[0], vertices) for corner in corners]
@@ -230,6 +230,8 @@ def _topology(faces: Tensor, uvs: Tensor, uv_faces: Tensor) -> tuple[Tensor, Ten
 
 def _index(word: str, count: int) -> int:
     number = int(word)
+    if not abs(number) < 1 << 31:
+        raise ValueError(f"number {word[:40]}")
     return number - 1 if number > 0 else count + number
 
 

@@ -66,11 +66,13 @@ def region_masks(head: HeadModel) -> dict[str, Tensor]:
 
 def _smooth(values: Tensor, faces: Tensor, rounds: int) -> Tensor:
     """Vertex values [V] or [V,C], each averaged half and half with its neighbours `rounds` times."""
-    edges = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    edges = torch.cat((edges, edges.flip(1))).unique(dim=0)
-    degree = torch.bincount(edges[:, 0], minlength=len(values)).clamp_min(1).to(values.dtype)
+    count = len(values)
+    one, other = torch.cat((faces, faces.roll(1, 1))).flatten(), torch.cat((faces.roll(1, 1), faces)).flatten()
+    pairs = (one * count + other).unique()  # of numbers, which is much faster than of rows
+    start, end = pairs // count, pairs % count
+    degree = torch.bincount(start, minlength=count).clamp_min(1).to(values.dtype)
     for _ in range(rounds):
-        total = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
+        total = torch.zeros_like(values).index_add(0, start, values[end])
         values = 0.5 * values + 0.5 * total / degree.view(-1, *(1,) * (values.ndim - 1))
     return values
 
@@ -106,7 +108,7 @@ def _ramp(at: Tensor, knots: tuple[float, ...], values: tuple[float | Tensor, ..
 def _ears(head: HeadModel, skin: Tensor) -> Tensor:
     points = head.template
     # Sideways only: smoothing an ear draws the skull around it outwards just as far.
-    relief = points[:, 0] - _smooth(points, head.faces, EAR_ROUNDS)[:, 0]
+    relief = points[:, 0] - _smooth(points[:, 0], head.faces, EAR_ROUNDS)
     middle = head.joints[3:5].mean(0)
     height = points[:, 1] - middle[1]
     level = skin & (height > -0.06) & (height < 0.04) & (points[:, 2] < middle[2] - 0.03)
