@@ -1,15 +1,17 @@
 """Refinement by colours trusts landmarks as far as their errors allow."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from tests.fitting.landmarks import seen
-from uika.fitting import fit_landmarks
+from uika.fitting import fit_landmarks, fit_photos
 from uika.fitting.landmark_prior import identity_modes, landmark_anchor, landmark_trust
-from uika.fitting.landmarks import eye_distance
-from uika.fitting.refinement import refine_landmark_fit
+from uika.fitting.landmarks import LandmarkFit, eye_distance
+from uika.fitting.refinement import follow_known_face, refine_landmark_fit
 from uika.head import Camera, HeadModel, HeadParameters, load_head, look_at, pose_vertices, project
 from uika.head.axis_angle import rotation
 from uika.head.face_paint import paint, shade
@@ -99,3 +101,44 @@ def test_one_photo_stays_as_it_is(head: HeadModel, photos: tuple[Tensor, list[Te
     _, pictures, marks = photos
     found = fit_landmarks(marks[:1], head, SIZE)
     assert refine_landmark_fit(found, pictures[:1], marks[:1], head) == (found, None)
+
+
+def test_a_new_photo_is_put_where_its_colours_are(head: HeadModel, photos: tuple[Tensor, list[Tensor], Tensor]) -> None:
+    identity, pictures, marks = photos
+    known = fit_landmarks(marks[1:], head, SIZE, identity)
+    place = marks[:1] / SIZE - 0.5
+    # A detector's errors are smooth: here it sees the face too high and its lower half too small.
+    wrong = marks[:1] + 5 * torch.stack((0.3 * place[..., 1], 1.5 * place[..., 1].abs() - 0.5), -1)
+    found = fit_landmarks(wrong, head, SIZE, identity)
+    followed = follow_known_face(found, pictures[:1], wrong, head, known, pictures[1:], marks[1:])
+    before, after = (face_pixels(head, each) - (marks[:1, head.landmark_ids] - SIZE / 2) for each in (found, followed))
+    assert torch.equal(followed.identity, found.identity)
+    assert after.norm(dim=-1).mean() < 0.5 * before.norm(dim=-1).mean()
+
+
+def face_pixels(head: HeadModel, fit: LandmarkFit) -> Tensor:
+    """Where the face's landmarks lie in each photo, [N,L,2] pixels from the principal point."""
+    points, identity, expression = (
+        head.landmarks(part).double() for part in (head.template, head.identity_basis, head.expression_basis)
+    )
+    points = points + torch.einsum("k,klc->lc", fit.identity, identity)
+    points = points + torch.einsum("ne,elc->nlc", fit.expression, expression)
+    camera = points @ fit.rotation.mT + fit.translation[:, None]
+    return fit.focal[:, None, None] * camera[..., :2] / camera[..., 2:]
+
+
+@dataclass
+class Photo:
+    landmarks: Tensor
+    matte: Tensor
+
+
+def test_a_known_fit_with_images_leads_new_photos(head: HeadModel, photos: tuple[Tensor, list[Tensor], Tensor]) -> None:
+    _, pictures, marks = photos
+    taken = [Photo(mark, torch.ones(SIZE, SIZE)) for mark in marks]
+    known = fit_photos(taken[1:], head, images=pictures[1:])
+    assert known.images is not None
+    led = fit_photos(taken[:1], head, images=pictures[:1], known=known)
+    alone = fit_photos(taken[:1], head, images=pictures[:1], known=replace(known, images=None))
+    assert not torch.equal(led.cameras.viewmat, alone.cameras.viewmat)
+    assert torch.equal(led.parameters.identity, alone.parameters.identity)

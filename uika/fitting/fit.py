@@ -11,8 +11,8 @@ from torch import Tensor
 
 from uika.fitting.hair import fit_hair
 from uika.fitting.landmark_bias import unbiased
-from uika.fitting.landmarks import fit_landmarks
-from uika.fitting.refinement import Gain, refine_landmark_fit
+from uika.fitting.landmarks import LandmarkFit, fit_landmarks
+from uika.fitting.refinement import Gain, follow_known_face, refine_landmark_fit
 from uika.fitting.surface_marks import SurfaceMarks
 from uika.fitting.teeth import teeth_offset
 from uika.head import Camera, HeadModel, HeadParameters
@@ -40,6 +40,7 @@ class Fit:
     error [N]: mean landmark distance in outer eye-corner distances. gain: of the refinement by colours, if it ran.
     landmarks [N,478,2]: as detected, crop pixels, where they are known.
     head_mattes [N,S,S]: of head and hair, where they were given.
+    images: [3,S,S] each, where the colours were to refine the fit.
     """
 
     parameters: HeadParameters
@@ -49,6 +50,7 @@ class Fit:
     gain: Gain | None = None
     landmarks: Tensor | None = None
     head_mattes: Tensor | None = None
+    images: tuple[Tensor, ...] | None = None
 
 
 def fit_photos(
@@ -68,12 +70,14 @@ def fit_photos(
         photos: prepared photos of one person, all cropped to the same size.
         head: the head model.
         head_mattes: [S,S] per photo, head and hair without shoulders; None fits no hair.
-        images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours they share; None does not.
+        images: [3,S,S] per photo, sRGB in [0,1]: refine identity and poses with the colours that they share, or share
+            with `known`; None does not.
         focals: per photo, the focal length in crop pixels that its camera noted, None where it did not.
         correct_detector: take the face mesh's mean error on turned faces out of the landmarks first. It moves marks off
             the contours that they were found at, but several views then agree on shape and distance. None does so
             where views have to agree: with two or more photos, or a known person.
-        known: an earlier fit of the person, whose identity and hair are kept as they are.
+        known: an earlier fit of the person, whose identity and hair are kept as they are; if it has images, the
+            colours of its face refine the new poses.
         marks: where the photos show other points of the surface, see `uika.fitting.SurfaceMarks`.
 
     Raises:
@@ -96,6 +100,8 @@ def fit_photos(
     found, gain = fit_landmarks(landmarks, head, width, identity, focal, marks), None
     if images is not None and known is None:
         found, gain = refine_landmark_fit(found, images, landmarks, head)
+    elif images is not None and known is not None and known.images is not None and known.landmarks is not None:
+        found = follow_known_face(found, images, landmarks, head, _solved(known), known.images, known.landmarks)
     N = len(photos)
     viewmat = torch.eye(4).repeat(N, 1, 1)
     viewmat[:, :3, :3], viewmat[:, :3, 3] = found.rotation.float(), found.translation.float()
@@ -111,4 +117,17 @@ def fit_photos(
     if mattes is not None and known is None:
         offset = offset + fit_hair(head, parameters, cameras, mattes)
     detected = torch.stack([photo.landmarks for photo in photos])
-    return Fit(parameters, cameras, offset, found.error.float(), gain, detected, mattes)
+    pictures = None if images is None else tuple(images)
+    return Fit(parameters, cameras, offset, found.error.float(), gain, detected, mattes, pictures)
+
+
+def _solved(fit: Fit) -> LandmarkFit:
+    viewmat, parameters = fit.cameras.viewmat.double(), fit.parameters
+    return LandmarkFit(
+        parameters.identity[0].double(),
+        parameters.expression.double(),
+        viewmat[:, :3, :3],
+        viewmat[:, :3, 3],
+        fit.cameras.K[:, 0, 0].double(),
+        fit.error.double(),
+    )
