@@ -87,6 +87,15 @@ def test_a_photo_added_later_comes_under_the_same_light(head: HeadModel) -> None
     assert ((whole.basis @ (later - together))[whole.weight[2] > 0]).abs().mean() < 0.06
 
 
+def test_the_common_light_is_the_mean_by_the_photos_shares(head: HeadModel) -> None:
+    none = torch.zeros(len(head.identity_basis)), torch.zeros_like(head.template)
+    sample = sample_light(head, *none, *photos(head, LIGHTS))
+    apart, share = relative_lights(sample, 0), torch.tensor([2.0, 1.0, 1.0])
+    common = relative_lights(sample, 0, share)
+    assert (common * share[:, None, None]).sum(0).abs().max() < 1e-5
+    torch.testing.assert_close(common - common[:1], apart, atol=1e-5, rtol=0)
+
+
 def test_one_photo_tells_its_light_when_skin_is_alike(head: HeadModel) -> None:
     none = torch.zeros(len(head.identity_basis)), torch.zeros_like(head.template)
     images, uv, weight = photos(head, LIGHTS[:1])

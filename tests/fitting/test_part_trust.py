@@ -48,6 +48,14 @@ def test_parts_must_agree_with_the_landmarks() -> None:
     assert teeth[90, 64] == 1 and teeth[110, 64] == 0
 
 
+def test_lips_may_lie_a_little_apart() -> None:
+    marks, nothing = landmarks(10), torch.zeros(SIZE, SIZE)
+    rim = opening_trust(marks, SIZE, nothing, nothing)[90 - 10 : 90 + 10, 64]
+    assert rim[0] == 1 and rim[10] == 0  # skin of the fit just inside the landmarks' lips, and in their middle
+    teeth = opening_trust(marks, SIZE, nothing, nothing + 1)[:, 64]
+    assert teeth[90 + 11] == 1 and teeth[90 + 15] == 0  # teeth of the fit just below them, and far below
+
+
 def test_shut_lips_hide_nothing() -> None:
     skin = opening_trust(landmarks(0.5), SIZE, torch.zeros(SIZE, SIZE), torch.zeros(SIZE, SIZE))
     assert skin[88:93, 50:78].min() == 1

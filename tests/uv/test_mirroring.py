@@ -20,9 +20,13 @@ def test_halves_seen_alike_are_both_kept() -> None:
 
 
 def test_the_grazed_half_gives_way_to_the_near_one() -> None:
-    kept = preference(0.9, 0.3)
+    kept = preference(0.9, 0.12)
     assert kept[:, : SIZE // 2 - 6].min() == 1
     assert kept[:, SIZE // 2 + 6 :].max() < 0.1
+
+
+def test_a_half_that_was_seen_fairly_stays_though_the_other_was_seen_better() -> None:
+    assert preference(1.0, 0.42)[:, SIZE // 2 + 6 :].min() == 1
 
 
 def test_nothing_is_lost_where_there_is_no_other_half() -> None:

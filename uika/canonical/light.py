@@ -80,10 +80,16 @@ def joined(first: LightSample, second: LightSample) -> LightSample:
 
 
 @torch.no_grad()
-def relative_lights(sample: LightSample, reference: int) -> Tensor:
-    """Each photo's light over the reference's, [N,9,3]: log factors of linear colours, by `harmonics` of the normal.
+def relative_lights(sample: LightSample, reference: int, share: Tensor | None = None) -> Tensor:
+    """Each photo's light over a common one, [N,9,3]: log factors of linear colours, by `harmonics` of the normal.
 
-    A photo that shares too little with the others, and a single photo, get 0.
+    Args:
+        sample: of N photos.
+        reference: the photo from which the others are told apart.
+        share: [N] of each photo in the common light, which is their mean; None takes the reference's.
+
+    Returns:
+        0 for a single photo; the reference's for a photo that shares too little with the others.
     """
     log = sample.color.clamp_min(_DARK).log()
     count = len(log)
@@ -104,7 +110,7 @@ def relative_lights(sample: LightSample, reference: int) -> Tensor:
             target = _mean(bare, weight * robust * rest)
             own = own * ((weight * rest).sum(0) > 0)
             lights[n] = _solve(sample.basis, log[n] - target, own)
-    return lights
+    return lights if share is None else lights - torch.einsum("n,nkc->kc", share / share.sum(), lights)
 
 
 def _mean(values: Tensor, weight: Tensor) -> Tensor:

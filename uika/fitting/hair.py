@@ -29,7 +29,7 @@ EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows 
 EAR_RINGS, EAR_ROUNDS = 3, 80
 FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
 HANGING_LOSS = 0.02  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
-TURN_POWER = 64  # of the cosine of a face's turn: half the trust at 8 degrees, next to none from 30
+TURN_POWER = 16  # of the cosine of a face's turn: half the trust at 17 degrees, a tenth at 30
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
 

@@ -15,6 +15,7 @@ LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387
 INNER_LIPS = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 415, 310, 311, 312, 13, 82, 81, 80, 191)
 EYE_CORNERS = (33, 263)
 MARGIN = 0.006  # of the eye corners' distance: width of the edge of an eye that shows lashes and shadow
+LIP_MARGIN = 0.02  # of that distance, by which lips of the fit and of the landmarks may lie apart
 OPEN = 0.05  # height over width from which an opening shows what lies behind it
 SMOOTH, FOLDED = 1.15, 1.6  # stretch of a lid from now to shut between which it loses trust
 LID_DOUBT, FOLD_DOUBT = 0.3, 0.98  # of a lid that lies open, and of one that is folded away
@@ -60,13 +61,15 @@ def opening_trust(landmarks: Tensor, size: int, eyeball: Tensor, mouth: Tensor) 
         mouth: [S,S] share that it gives to teeth or the mouth's inside.
     """
     marks = landmarks.double().numpy()
-    reach = max(1, round(MARGIN * float(np.linalg.norm(marks[EYE_CORNERS[0]] - marks[EYE_CORNERS[1]]))))
+    distance = float(np.linalg.norm(marks[EYE_CORNERS[0]] - marks[EYE_CORNERS[1]]))
+    reach, slack = (max(1, round(margin * distance)) for margin in (MARGIN, LIP_MARGIN))
     eyes = _opening(marks, RIGHT_EYE, size) | _opening(marks, LEFT_EYE, size)
     trust = torch.ones(size, size)
     trust[(eyeball > 0.5) & ~_shrunk(eyes, reach)] = 0.0
     trust[(eyeball < 0.5) & _shrunk(eyes, 2 * reach)] = 0.0
     lips = _opening(marks, INNER_LIPS, size)
-    trust[(mouth > 0.5) != lips] = 0.0
+    trust[(mouth > 0.5) & ~_grown(lips, slack)] = 0.0
+    trust[(mouth < 0.5) & _shrunk(lips, slack)] = 0.0
     return trust
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from uika.uv import Sums
 
 _UNTRAINED_OPACITY = 0.95
+_ASIDE, _FRONTAL = 0.7, 0.9  # cosines of a face's turn between which its light counts: on a profile it falls otherwise
 
 
 class CanonicalHead:
@@ -67,7 +68,7 @@ class CanonicalHead:
         self._session = Session(loaded.network, self.binding.texel, self._surface, keep, prior, growing=growing)
         self._run, self._on_template = loaded.run, loaded.on_template
         self._lit: LightSample | None = None
-        self.light: Tensor | None = None  # [9,3] of the photo whose light the colours are kept under
+        self.light: Tensor | None = None  # [9,3] that the colours are kept under
 
     @torch.no_grad()
     def add(self, fit: Fit | None, images: Tensor, mattes: Tensor, report: Report) -> tuple[Tensor, ...]:
@@ -122,11 +123,13 @@ class CanonicalHead:
         return uv[None], weight
 
     def _under_one_light(self, fit: Fit, images: Tensor, uv: Tensor, weight: Tensor) -> Tensor:
-        """The photos as if taken under the light of the most frontal one of the first call."""
+        """The photos as if taken under the mean light of the first call's that face the camera."""
         sample = sample_light(self._head, self.identity, self.static_offset, images, uv, weight)
         known, before = (sample, 0) if self._lit is None else (joined(self._lit, sample), 1)
-        reference = 0 if before else int(fit.cameras.viewmat[:, 2, 2].argmin())
-        lights = relative_lights(known, reference)
+        facing = (-fit.cameras.viewmat[:, 2, 2]).clamp_min(1e-3)
+        share = ((facing / facing.max() - _ASIDE) / (_FRONTAL - _ASIDE)).clamp(0, 1)
+        reference = 0 if before else int(facing.argmax())
+        lights = relative_lights(known, reference, None if before else share)
         if self.light is None:
             self.light = absolute_light(known, lights, reference)
         self._lit = remembered(known, lights)

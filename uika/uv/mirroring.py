@@ -8,6 +8,7 @@ from torch.nn import functional
 
 _BLUR = 9  # texels over which it is judged how well a place was seen
 _POWER = 3.0
+_BARELY, _FAIRLY = 0.1, 0.4  # trust between which what was seen is kept, however well the other half was
 _FRONTAL, _TURNED = 0.12, 0.35  # unevenness of the halves between which the preference comes in
 
 
@@ -28,6 +29,7 @@ def mirror_preference(trust: Tensor, valid: Tensor, mirror: Tensor) -> Tensor:
     own = functional.avg_pool2d(trust * valid, _BLUR, 1, _BLUR // 2) / near.clamp_min(1e-6)
     other = own.flatten(2)[:, :, mirror.clamp_min(0).flatten()].reshape(own.shape)
     kept = (2 * own**_POWER / (own**_POWER + other**_POWER).clamp_min(1e-9)).clamp(max=1)
+    kept = torch.maximum(kept, ((own - _BARELY) / (_FAIRLY - _BARELY)).clamp(0, 1))
     uneven, total = ((value * usable).sum((1, 2, 3)) for value in ((own - other).abs(), own + other))
     gate = ((uneven / total.clamp_min(1e-9) - _FRONTAL) / (_TURNED - _FRONTAL)).clamp(0, 1)
     return torch.where(usable, 1 - gate[:, None, None, None] * (1 - kept), torch.ones_like(kept))
