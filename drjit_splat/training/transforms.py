@@ -80,9 +80,7 @@ def _photo(path: Path, document: dict[str, Any], frame: Any, index: int) -> Phot
     if not all(map(math.isfinite, values)) or min(fx, fy) <= 0:
         raise ValueError(f"{source}: focal lengths and centre must be finite, focal lengths positive, not {values}")
     with contextlib.suppress(np.linalg.LinAlgError):
-        matrix = np.asarray(
-            np.linalg.inv(matrix @ _FLIP), dtype=np.float64
-        )  # no inverse: no rotation
+        matrix = np.asarray(np.linalg.inv(matrix @ _FLIP), dtype=np.float64)  # no inverse: no rotation
     if not 0 < width < 1 << 16 > height > 0:
         raise ValueError(f"{source}: its picture cannot have {width} x {height} pixels")
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
