@@ -43,14 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
     config.check()
     capture = open_capture(arguments.data, config.every)
     print(f"{len(capture.photos)} photos to learn from, {len(capture.held_out)} held out")
-    with _bar(config.steps) as bar, _page(arguments.view) as page:
+    with _bar(config.steps) as bar, _page(arguments.view, capture) as page:
 
         def watch(progress: Progress, params: dict[str, Any]) -> None:
             if bar is not None:
                 bar.update(progress.step - bar.n)
                 bar.set_postfix(psnr=f"{progress.psnr:.1f}", splats=f"{progress.splats:,}", refresh=False)
             if page is not None and progress.step % _VIEW_EVERY == 0:
-                page.show(params)
+                page.show(params, progress)
 
         figures = train(capture, arguments.output, config, watch=watch)
     if figures["psnr"] is not None:
@@ -72,13 +72,13 @@ def _bar(steps: int) -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def _page(wanted: bool) -> Iterator[Any]:
+def _page(wanted: bool, capture: Any) -> Iterator[Any]:
     if not wanted:
         yield None
         return
     from .page import TrainingPage
 
-    page = TrainingPage()
+    page = TrainingPage(capture)
     print(f"the training is shown at {page.address}")
     try:
         yield page
