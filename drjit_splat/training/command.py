@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -42,8 +43,11 @@ def run(arguments: argparse.Namespace) -> int:
     config = TrainConfig(**{field.name: getattr(arguments, field.name) for field in fields(TrainConfig)})
     config.check()
     capture = open_capture(arguments.data, config.every)
-    print(f"{len(capture.photos)} photos to learn from, {len(capture.held_out)} held out")
-    with _bar(config.steps) as bar, _page(arguments.view, capture) as page:
+    # Of several processes the first one speaks.
+    first = os.environ.get("RANK", "0") == "0"
+    if first:
+        print(f"{len(capture.photos)} photos to learn from, {len(capture.held_out)} held out")
+    with _bar(config.steps, first) as bar, _page(arguments.view and first, capture) as page:
 
         def watch(progress: Progress, params: dict[str, Any]) -> None:
             if bar is not None:
@@ -53,6 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
                 page.show(params, progress)
 
         figures = train(capture, arguments.output, config, watch=watch)
+    if not figures:
+        return 0
     if figures["psnr"] is not None:
         print(f"held out: PSNR {figures['psnr']:.2f} dB, SSIM {figures['ssim']:.4f}")
     print(f"wrote {Path(arguments.output) / SPLATS}: {figures['splats']:,} splats, {figures['seconds']:.0f} s")
@@ -60,8 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _bar(steps: int) -> Iterator[Any]:
+def _bar(steps: int, wanted: bool) -> Iterator[Any]:
     """A progress bar on stderr, where tqdm is installed and somebody looks."""
+    if not wanted:
+        yield None
+        return
     try:
         from tqdm import tqdm
     except ModuleNotFoundError:

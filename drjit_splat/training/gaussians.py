@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -55,17 +56,30 @@ def neighbour_distances(points: Tensor) -> Tensor:
     return found.mean(-1).sqrt() if nearest > 1 else torch.full((len(points),), 0.01)
 
 
-def optimizers(params: dict[str, torch.nn.Parameter], extent: float) -> dict[str, torch.optim.Optimizer]:
-    """One Adam for each parameter; the means' rate is in units of the scene."""
+def optimizers(
+    params: dict[str, torch.nn.Parameter], extent: float, photos: int = 1
+) -> dict[str, torch.optim.Optimizer]:
+    """One Adam for each parameter; the means' rate is in units of the scene.
+
+    With several `photos` a step rates grow by the root of their number and Adam forgets as fast photo by photo, as in
+    gsplat's trainer.
+    """
+    betas = tuple(max(0.0, 1 - photos * (1 - beta)) for beta in (0.9, 0.999))
     return {
-        name: torch.optim.Adam([value], lr=RATES[name] * (extent if name == "means" else 1.0), eps=EPSILON)
+        name: torch.optim.Adam(
+            [value], lr=_rate(name, extent, photos), betas=(betas[0], betas[1]), eps=EPSILON / math.sqrt(photos)
+        )
         for name, value in params.items()
     }
 
 
-def set_rate(chosen: dict[str, torch.optim.Optimizer], extent: float, step: int, steps: int) -> float:
+def _rate(name: str, extent: float, photos: int) -> float:
+    return RATES[name] * (extent if name == "means" else 1.0) * math.sqrt(photos)
+
+
+def set_rate(chosen: dict[str, torch.optim.Optimizer], extent: float, step: int, steps: int, photos: int = 1) -> float:
     """Let the means' rate fall exponentially; returns it."""
-    rate = RATES["means"] * extent * LAST_RATE ** (step / max(steps - 1, 1))
+    rate = _rate("means", extent, photos) * LAST_RATE ** (step / max(steps - 1, 1))
     chosen["means"].param_groups[0]["lr"] = rate
     return rate
 

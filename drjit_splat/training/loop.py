@@ -15,12 +15,15 @@ from torch import Tensor
 
 from ..rasterizer import rasterization
 from ..strategy import DefaultStrategy, MCMCStrategy
+from ..strategy.base import Optimizers, Parameters
 from ..strategy.ops import remove
 from . import checkpoint, corrections, gaussians
 from .captures import Capture, Photo
 from .config import TrainConfig
+from .processes import Processes, joined
 from .similarity import psnr, ssim
 
+SUMS = ("grad2d", "count")  # entries of the default strategy's state that add up over photos
 SPLATS, LOG, FIGURES = "splats.ply", "log.jsonl", "evaluation.json"
 _LOG_EVERY = 50
 _SCALE_WEIGHT = _OPACITY_WEIGHT = 0.01  # of the means of scales and opacities, as MCMC wants them
@@ -37,16 +40,20 @@ class Progress:
     seconds: float
 
 
+Watch = Callable[[Progress, dict[str, torch.nn.Parameter]], None]
+
+
 def train(
     capture: Capture,
     output: str | Path,
     config: TrainConfig | None = None,
     *,
-    watch: Callable[[Progress, dict[str, torch.nn.Parameter]], None] | None = None,
+    watch: Watch | None = None,
 ) -> dict[str, Any]:
     """Train, evaluate on the held-out photos and write `splats.ply`, `evaluation.json`, `log.jsonl` and checkpoints.
 
     A folder with a checkpoint of the same settings is gone on with; its losses are those of a run that never stopped.
+    Under torchrun each process learns from a photo of its own at every step, and the first one writes.
 
     Args:
         capture: the photos.
@@ -55,7 +62,8 @@ def train(
         watch: called after every step.
 
     Returns:
-        The figures of `evaluation.json`: PSNR and SSIM of each held-out photo and their means, splats, steps, seconds.
+        The figures of `evaluation.json`: PSNR and SSIM of each held-out photo and their means, splats, steps, seconds;
+        nothing in processes that do not write.
 
     Raises:
         ValueError: a photo or the checkpoint cannot be used, the checkpoint has other settings, or the loss is no
@@ -65,7 +73,12 @@ def train(
     config.check()
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
-    run = _Run(capture, config, checkpoint.load(folder))
+    with joined() as processes:
+        return _train(_Run(capture, config, checkpoint.load(folder), processes), folder, watch)
+
+
+def _train(run: _Run, folder: Path, watch: Watch | None) -> dict[str, Any]:
+    config, first = run.config, run.processes.first
     begun = time.perf_counter() - run.seconds
     while run.step < config.steps:
         progress = run.advance(time.perf_counter() - begun)
@@ -73,14 +86,19 @@ def train(
             raise ValueError(
                 f"{folder}: the loss is no longer finite at step {progress.step}; the last checkpoint is kept"
             )
-        if progress.step % _LOG_EVERY == 0 or progress.step == config.steps:
+        last = progress.step == config.steps
+        if first and (progress.step % _LOG_EVERY == 0 or last):
             with (folder / LOG).open("a") as file:
                 file.write(json.dumps(vars(progress)) + "\n")
-        if progress.step % config.checkpoint_every == 0 or progress.step == config.steps:
+        if progress.step % config.checkpoint_every == 0 or last:
             run.seconds = progress.seconds
-            checkpoint.save(folder, run.checkpoint())
-        if watch is not None:
+            known = run.checkpoint()
+            if first:
+                checkpoint.save(folder, known)
+        if first and watch is not None:
             watch(progress, run.params)
+    if not first:
+        return {}
     gaussians.write(run.params, folder / SPLATS)
     figures = run.evaluate() | {"steps": run.step, "splats": len(run.params["means"]), "seconds": run.seconds}
     (folder / FIGURES).write_text(json.dumps(figures, indent=1) + "\n")
@@ -90,15 +108,17 @@ def train(
 class _Run:
     """The state of a run."""
 
-    def __init__(self, capture: Capture, config: TrainConfig, known: checkpoint.Checkpoint | None) -> None:
+    def __init__(
+        self, capture: Capture, config: TrainConfig, known: checkpoint.Checkpoint | None, processes: Processes
+    ) -> None:
         if known is not None and known.config != config:
             raise ValueError(
                 "the run's folder has a checkpoint of other settings; go on with the same or take another folder"
             )
-        self.capture, self.config, self.extent = capture, config, capture.extent
+        self.capture, self.config, self.extent, self.processes = capture, config, capture.extent, processes
         self.params = gaussians.start(capture, config)
         self.corrections = corrections.start(len(capture.photos), config)
-        self.strategy = _strategy(config)
+        self.strategy = _strategy(config, processes)
         self.state: dict[str, Any] = (
             self.strategy.initialize_state()
             if isinstance(self.strategy, MCMCStrategy)
@@ -113,7 +133,10 @@ class _Run:
             for name in self.corrections:
                 self.corrections[name] = torch.nn.Parameter(tensors[f"param/{name}"])
             self.state |= {key.removeprefix("state/"): v for key, v in tensors.items() if key.startswith("state/")}
-        self.optimizers = gaussians.optimizers(self.params, self.extent)
+            if not processes.first:
+                for sums in self._sums():
+                    sums.zero_()
+        self.optimizers = gaussians.optimizers(self.params, self.extent, processes.count)
         self.correcting = corrections.optimizers(self.corrections)
         checkpoint.restore_optimizers({**self.optimizers, **self.correcting}, tensors)
         self._pictures: dict[tuple[int, int], Tensor] = {}
@@ -123,7 +146,7 @@ class _Run:
         # Everything that is drawn depends on the step alone, so that a run can be stopped anywhere.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed * 1_000_003 + self.step)
-            rate = gaussians.set_rate(self.optimizers, self.extent, self.step, self.config.steps)
+            rate = gaussians.set_rate(self.optimizers, self.extent, self.step, self.config.steps, self.processes.count)
             index = self._photo()
             photo = self.capture.photos[index]
             shrink = self.config.shrink(self.step, min(photo.width, photo.height))
@@ -137,11 +160,15 @@ class _Run:
             if isinstance(self.strategy, DefaultStrategy):
                 self.strategy.step_pre_backward(self.params, self.optimizers, self.state, self.step, info)
             loss.backward()
-            if math.isfinite(loss.item()):
+            figures = torch.tensor([loss.item(), psnr(shown.detach().clamp(0, 1), wanted)], dtype=torch.float64)
+            self.processes.average([figures])
+            value, quality = figures.tolist()
+            if math.isfinite(value):
+                gradients = [p.grad for p in (*self.params.values(), *self.corrections.values())]
+                self.processes.average([gradient for gradient in gradients if gradient is not None])
                 self._update(info, rate)
         self.step += 1
-        quality = psnr(shown.detach().clamp(0, 1), wanted)
-        return Progress(self.step, loss.item(), quality, len(self.params["means"]), seconds)
+        return Progress(self.step, value, quality, len(self.params["means"]), seconds)
 
     def _update(self, info: dict[str, Any], rate: float) -> None:
         for optimizer in (*self.optimizers.values(), *self.correcting.values()):
@@ -186,10 +213,10 @@ class _Run:
         return image[0], info
 
     def _photo(self) -> int:
-        """Which photo this step learns from: each once, in a new order every round."""
-        count = len(self.capture.photos)
-        turn = torch.Generator().manual_seed(self.config.seed * 7919 + self.step // count)
-        return int(torch.randperm(count, generator=turn)[self.step % count])
+        """Which photo this step learns from: each once, in a new order every round, dealt to the processes in turn."""
+        count, place = len(self.capture.photos), self.step * self.processes.count + self.processes.rank
+        turn = torch.Generator().manual_seed(self.config.seed * 7919 + place // count)
+        return int(torch.randperm(count, generator=turn)[place % count])
 
     def _picture(self, index: int, shrink: int) -> Tensor:
         if (index, shrink) not in self._pictures:
@@ -211,8 +238,13 @@ class _Run:
         }
         return {**means, "held_out": rows}
 
+    def _sums(self) -> list[Tensor]:
+        """What the strategy has added up over the photos."""
+        return [value for name in SUMS if isinstance(value := self.state.get(name), Tensor)]
+
     def checkpoint(self) -> checkpoint.Checkpoint:
-        """All that the rest of the run depends on."""
+        """All that the rest of the run depends on; every process must ask."""
+        self.processes.add_up(self._sums(), keep=False)
         tensors: dict[str, Tensor] = {
             f"param/{name}": value for name, value in (*self.params.items(), *self.corrections.items())
         }
@@ -221,16 +253,28 @@ class _Run:
         return checkpoint.Checkpoint(self.step, self.seconds, self.config, tensors)
 
 
-def _strategy(config: TrainConfig) -> DefaultStrategy | MCMCStrategy:
+class _Together(DefaultStrategy):
+    """The strategy over what all processes have seen."""
+
+    processes = Processes()
+
+    def _grow(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
+        self.processes.add_up([state[name] for name in SUMS], keep=True)
+        return super()._grow(params, optimizers, state, step)
+
+
+def _strategy(config: TrainConfig, processes: Processes) -> DefaultStrategy | MCMCStrategy:
     """The strategy with its schedule in shares of the run: 3DGS's own is made for 30,000 steps."""
     begin, every = min(500, config.steps // 14), max(1, min(100, config.steps // 70))
     if config.strategy == "mcmc":
         stop = max(begin + 1, int(0.8 * config.steps))
         return MCMCStrategy(config.max_splats, refine_start_iter=begin, refine_stop_iter=stop, refine_every=every)
     stop = max(begin + 1, config.steps // 2)
-    return DefaultStrategy(
+    strategy = _Together(
         refine_start_iter=begin, refine_stop_iter=stop, refine_every=every, reset_every=max(3000, config.steps // 5)
     )
+    strategy.processes = processes
+    return strategy
 
 
 def _over(pixels: Tensor, background: Tensor) -> Tensor:
