@@ -9,6 +9,7 @@ from ._version import __version__
 
 if TYPE_CHECKING:
     from . import reference
+    from ._compat import rasterization_2dgs
     from ._harmonics import sh_colors
     from ._settings import Options
     from .files import load_splats
@@ -34,6 +35,7 @@ _HOMES = {
     "profile": "profiling",
     "project_frame": "frames",
     "rasterization": "rasterizer",
+    "rasterization_2dgs": "_compat",
     "save_ply": "ply",
     "save_splat": "splat",
     "save_spz": "spz",
@@ -55,6 +57,7 @@ __all__ = [
     "profile",
     "project_frame",
     "rasterization",
+    "rasterization_2dgs",
     "reference",
     "save_ply",
     "save_splat",

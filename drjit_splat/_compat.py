@@ -61,3 +61,14 @@ def settings_of(width: Any, height: Any, options: Options | None, arguments: dic
     own = {name: value for name, value in arguments.items() if name in Settings.__dataclass_fields__}
     check_compatibility({k: v for k, v in arguments.items() if k not in own and k not in _OF_META})
     return Settings.of(width, height, options, **own)
+
+
+def rasterization_2dgs(*_: Any, **__: Any) -> Any:
+    """Refuse: it is here so that programs that import it beside `rasterization` run as long as they do not call it.
+
+    Raises:
+        NotImplementedError: always.
+    """
+    raise NotImplementedError(
+        "rasterization_2dgs is not available: 2D Gaussians (surfels) are not rendered; rasterization takes 3D ones"
+    )

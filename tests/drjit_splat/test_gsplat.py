@@ -151,3 +151,10 @@ def test_arguments_that_ask_for_more_are_refused(name: str, value: object) -> No
 def test_unknown_arguments_are_an_error() -> None:
     with pytest.raises(TypeError, match="'colour'"):
         rasterization(**one_splat(), width=16, height=16, colour=1)
+
+
+def test_surfels_are_refused_when_they_are_called() -> None:
+    from drjit_splat import rasterization_2dgs
+
+    with pytest.raises(NotImplementedError, match="rasterization_2dgs is not available: 2D Gaussians"):
+        rasterization_2dgs(**one_splat(), width=16, height=16)
