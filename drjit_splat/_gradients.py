@@ -14,7 +14,7 @@ from ._bridge import cross
 from ._call import PER_SPLAT, Call
 from ._project import Arrays
 from ._project_backward import InputGradients, OutputGradients
-from ._values import BETWEEN, packed, unpacked, visible_rows
+from ._values import BETWEEN, packed, shape_of, unpacked, visible_rows
 
 
 def arrays_of(count: int, columns: int, arrays: tuple[Any, ...]) -> Arrays:
@@ -142,7 +142,8 @@ def blend_gradients(
         absolute.append(own.new_zeros(n, 2) if found[10] is None else found[10].view(n, 2))
     result.inputs = sums.result(asked)
     if call.absgrad:
-        result.absolute = packed(call, torch.stack(absolute), 2)
+        shape = shape_of(call, len(absolute[0]), 2)
+        result.absolute = packed(call, torch.stack(absolute), 2).reshape(shape)
     return result
 
 

@@ -89,7 +89,8 @@ def test_sparse_gradients_are_the_dense_ones(cameras: int) -> None:
         found.append(leaves)
     for name, leaf in found[0].items():
         assert leaf.grad.is_sparse == (name in ("means", "quats", "scales")), name  # type: ignore[union-attr]
-        assert torch.equal(leaf.grad.to_dense(), found[1][name].grad), name  # type: ignore[union-attr, arg-type]
+        want = found[1][name].grad  # on a busy machine threads add up in another order
+        assert torch.allclose(leaf.grad.to_dense(), want, rtol=1e-5, atol=1e-6 * float(want.abs().max())), name  # type: ignore
     assert found[0]["means"].grad._nnz() < 140  # type: ignore[union-attr]
     torch.optim.SparseAdam([found[0]["means"]]).step()
     with pytest.raises(ValueError, match="sparse_grad"):

@@ -111,8 +111,9 @@ def test_gradients_in_between_are_the_oracles(packed: bool, names: tuple[str, ..
         assert float((found - want).norm()) <= 5e-5 * float(want.norm()), name
     untouched = leaves_of(given)
     rasterization(**untouched, **SIZE, render_mode="RGB+D")[0].backward(weight.float())
-    for name, leaf in leaves.items():
-        assert torch.equal(leaf.grad, untouched[name].grad), name  # type: ignore[arg-type]
+    for name, leaf in leaves.items():  # on a busy machine threads add up in another order
+        want = untouched[name].grad
+        assert torch.allclose(leaf.grad, want, rtol=1e-5, atol=1e-6 * float(want.abs().max())), name  # type: ignore
 
 
 def test_losses_on_the_values_in_between_reach_the_splats() -> None:
