@@ -63,6 +63,7 @@ def fit_photos(
     correct_detector: bool | None = None,
     known: Fit | None = None,
     marks: SurfaceMarks | None = None,
+    bounds: Sequence[tuple[float, float, float, float] | None] | None = None,
 ) -> Fit:
     """Fit one identity to all photos and expression, camera and hair to each (float32).
 
@@ -79,6 +80,7 @@ def fit_photos(
         known: an earlier fit of the person, whose identity and hair are kept as they are; if it has images, the
             colours of its face refine the new poses.
         marks: where the photos show other points of the surface, see `uika.fitting.SurfaceMarks`.
+        bounds: per photo, its left, top, right and lower edge in crop pixels, None where the crop lies inside.
 
     Raises:
         ValueError: there is no photo, or the photos have different sizes.
@@ -115,7 +117,9 @@ def fit_photos(
     offset = teeth_offset(head) if known is None else known.static_offset
     mattes = None if head_mattes is None else torch.stack(list(head_mattes))
     if mattes is not None and known is None:
-        offset = offset + fit_hair(head, parameters, cameras, mattes)
+        whole = (0.0, 0.0, float(width), float(height))
+        edges = None if bounds is None else torch.tensor([whole if each is None else each for each in bounds])
+        offset = offset + fit_hair(head, parameters, cameras, mattes, edges)
     detected = torch.stack([photo.landmarks for photo in photos])
     pictures = None if images is None else tuple(images)
     return Fit(parameters, cameras, offset, found.error.float(), gain, detected, mattes, pictures)

@@ -22,13 +22,19 @@ ROUNDS = 8
 ANGLES = 180  # directions around the head in which the outline is compared
 OUTLINE_SHARE = 0.985  # vertices this close to the outline, relative to its radius, belong to it
 RADII = 192
+EDGE = 3.0  # pixels from the photo's edge at which it cuts an outline
 BENDING, TENSION = 10.0, 0.05  # smoothness of the offset field against the outline's pull
-BACK_PULL = 1e-3
+REST_PULL = 1e-3  # towards the skull
+BACK_PULL = 2e-2  # of what no outline shows towards the hair's thickness at the sides
+MAX_USUAL = 0.05  # metres, of usual hair
+TEMPLES, CROWN = 0.02, 0.09  # metres between which it is looked at
+NAPE = -0.09  # metres, where it ends
+HIDDEN, UNTRUSTED = -0.2, 0.1  # cosine of the viewing angle of what is hidden; trust of photos that do not count
 FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
 EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows as it is, above which not at all
 EAR_RINGS, EAR_ROUNDS = 3, 80
 FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
-HANGING_LOSS = 0.02  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
+HANGING_LOSS = 0.015  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
 TURN_POWER = 16  # of the cosine of a face's turn: half the trust at 17 degrees, a tenth at 30
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
@@ -39,9 +45,13 @@ class _Region:
     smoothness: Any  # [R,R] sparse quadratic form of the membrane
     share: Tensor  # [R] in [0,1], how freely each may move
     lowest: Tensor  # [R] metres, how far each may move inward
+    sides: Tensor  # bool [R], at the height of the temples, where no bun or quiff stands
+    full: Tensor  # [R] share of the usual thickness, less towards the nape
 
 
-def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor) -> Tensor:
+def fit_hair(
+    head: HeadModel, parameters: HeadParameters, cameras: Camera, mattes: Tensor, bounds: Tensor | None = None
+) -> Tensor:
     """Offset [V,3] in metres that makes the silhouette meet the matte in every photo: at most 0.1 m along the normals.
 
     Hair that hangs beside the neck is let down first (`uika.fitting.long_hair`).
@@ -51,25 +61,34 @@ def fit_hair(head: HeadModel, parameters: HeadParameters, cameras: Camera, matte
         parameters: [N] fitted parameters, one identity, joints at rest.
         cameras: [N] fitted cameras.
         mattes: [N,S,S] head and hair without shoulders, in [0,1].
+        bounds: [N,4] left, top, right and lower edge of each photo in pixels of its crop: hair that reaches them goes
+            on beyond; None where a crop shows nothing but photo.
     """
     edges = _edges(head)
     region = _region(head, edges)
     centres = _centres(head, parameters, cameras)
-    reach = torch.stack([_reach(matte, at[0]) for matte, at in zip(mattes, centres, strict=True)])
+    size = float(mattes.shape[-1])
+    whole_crop = torch.tensor([0.0, 0.0, size, size]).expand(len(mattes), 4)
+    bounds = whole_crop if bounds is None else torch.cat((bounds[:, :2].clamp_min(0), bounds[:, 2:].clamp_max(size)), 1)
+    outlines = [_reach(matte, at[0], edge) for matte, at, edge in zip(mattes, centres, bounds, strict=True)]
+    reach, least = (torch.stack(part) for part in zip(*outlines, strict=True))
     trust = _trust(cameras)
     canonical = pose_vertices(head, parameters[0].replace(expression=torch.zeros_like(parameters[0].expression)))
     normals = _smooth_normals(vertex_normals(canonical, head.faces), edges)
     bald = pose_vertices(head, parameters)
+    towards = torch.nn.functional.normalize(cameras.position[:, None] - bald, dim=-1)
+    turned = (normals * towards).sum(-1) < HIDDEN
 
     def lift(flat: Tensor, trust: Tensor) -> Tensor:
+        hidden = (turned | (trust < UNTRUSTED)[:, None]).all(0) & (flat == 0).all(-1)
         still = flat[:, 1] < -FALLEN
         height = torch.zeros(len(head.template))
         for _ in range(ROUNDS):
             # The cameras carry the pose, so the offset simply adds to the posed head.
             vertices = bald + flat + height[:, None] * normals
-            wanted, pull = _outline_demand(head, vertices, cameras, centres, reach, trust, region)
+            wanted, pull = _outline_demand(head, vertices, cameras, centres, (reach, least), trust, region)
             pull = pull * ~still[region.vertices]
-            height = _membrane(region, height, wanted, pull)
+            height = _membrane(region, height, wanted, pull, hidden)
         return height
 
     def whole(hanging: Tensor, trust: Tensor) -> Tensor:
@@ -172,7 +191,10 @@ def _region(head: HeadModel, edges: Tensor) -> _Region:
     smoothness = BENDING * laplacian.T @ laplacian + 0.5 * TENSION * (laplacian + laplacian.T)
     # Mattes of heads end at the jaw: that they show no neck does not mean that there is none.
     lowest = MIN_OFFSET * (1 - head.masks["neck"].clamp(0, 1))
-    return _Region(vertices, smoothness, share[vertices], lowest[vertices])
+    height = head.template[vertices, 1]
+    sides = (height > TEMPLES) & (height < CROWN)
+    full = ((height - NAPE) / (TEMPLES - NAPE)).clamp(0, 1)
+    return _Region(vertices, smoothness, share[vertices], lowest[vertices], sides, full)
 
 
 def _centres(head: HeadModel, parameters: HeadParameters, cameras: Camera) -> Tensor:
@@ -182,8 +204,8 @@ def _centres(head: HeadModel, parameters: HeadParameters, cameras: Camera) -> Te
     return project(middle, cameras)[0]
 
 
-def _reach(matte: Tensor, centre: Tensor) -> Tensor:
-    """Radius [ANGLES] in pixels of the matte's outline around `centre`; NaN where it leaves the picture."""
+def _reach(matte: Tensor, centre: Tensor, bounds: Tensor) -> tuple[Tensor, Tensor]:
+    """Radius [ANGLES] in pixels of the matte's outline around `centre`, NaN where it leaves the photo; and at least."""
     S = matte.shape[0]
     angle = (torch.arange(ANGLES) + 0.5) * (2 * torch.pi / ANGLES)
     radius = torch.linspace(0.0, 0.75 * S, RADII * 2)
@@ -194,8 +216,8 @@ def _reach(matte: Tensor, centre: Tensor) -> Tensor:
     inside = value > 0.5
     last = torch.where(inside, radius[:, None], torch.zeros(())).amax(0)
     edge = centre + last[:, None] * along
-    cut = ((edge < 2.0) | (edge > S - 2.0)).any(-1) | ~inside.any(0)
-    return torch.where(cut, torch.nan, last)
+    cut = ((edge < bounds[:2] + EDGE) | (edge > bounds[2:] - EDGE)).any(-1) | ~inside.any(0)
+    return torch.where(cut, torch.nan, last), last
 
 
 def _outline_demand(
@@ -203,7 +225,7 @@ def _outline_demand(
     vertices: Tensor,
     cameras: Camera,
     centres: Tensor,
-    reach: Tensor,
+    outline_radii: tuple[Tensor, Tensor],
     trust: Tensor,
     region: _Region,
 ) -> tuple[Tensor, Tensor]:
@@ -220,7 +242,9 @@ def _outline_demand(
     spread = torch.nn.functional.max_pool1d(torch.cat((outline[:, -1:], outline, outline[:, :1]), 1)[:, None], 3, 1)[
         :, 0
     ]
-    gap = reach.gather(1, sector) - radius
+    reach, least = (each.gather(1, sector) - radius for each in outline_radii)
+    # Hair that the photo's edge cuts reaches at least so far.
+    gap = torch.where(reach.isnan() & (least > 0), least, reach)
     outward = (normals[..., :2] * ray / radius[..., None]).sum(-1)
     at = (radius > OUTLINE_SHARE * spread.gather(1, sector)) & (outward > 0.3) & gap.isfinite()
     metres = gap.nan_to_num() * depth / cameras.K[..., 0, 0][:, None] / outward.clamp(min=0.5)
@@ -230,7 +254,7 @@ def _outline_demand(
     return wanted[region.vertices], weight.sum(0)[region.vertices] * region.share
 
 
-def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor) -> Tensor:
+def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor, hidden: Tensor) -> Tensor:
     """Heights [V] after one round: outline vertices reach for their target, the rest follows smoothly."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
@@ -238,7 +262,12 @@ def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor) -> 
     weight = pull.double().numpy()
     target = (height[region.vertices] + wanted).clamp(max=MAX_OFFSET).maximum(region.lowest).double().numpy()
     stiff = FACE_PULL * (1.0 / region.share.double().clamp(min=0.02).numpy() - 1.0)
-    solved = spsolve((region.smoothness + sparse.diags(weight + BACK_PULL + stiff)).tocsc(), weight * target)
+    # What no outline shows would go on rising behind: it is drawn to the thickness of the hair at the sides.
+    aside = (pull > 0) & region.sides
+    usual = float((height[region.vertices] + wanted)[aside].clamp(0, MAX_USUAL).median()) if bool(aside.any()) else 0.0
+    back = (BACK_PULL * hidden[region.vertices] * region.share).double().numpy()
+    system = (region.smoothness + sparse.diags(weight + back + REST_PULL + stiff)).tocsc()
+    solved = spsolve(system, weight * target + back * usual * region.full.double().numpy())
     out = torch.zeros_like(height)
     out[region.vertices] = torch.from_numpy(solved).float().clamp(max=MAX_OFFSET).maximum(region.lowest)
     return out

@@ -10,7 +10,10 @@ from torch import Tensor
 
 from uika.canonical.surface import SurfaceTexels
 from uika.model.config import UvConfig
-from uika.uv import Sums, fill, mirror_preference, pool
+from uika.uv import Sums, close_gaps, fill, mirror_preference, pool
+
+GAP = 5  # texels between the rows of pixels that show a side at a grazing angle
+SIDE = 0.5  # share of the face below which a texel lies beside it
 
 
 class Observation(NamedTuple):
@@ -34,6 +37,9 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
     color = pooled.rgb
     if config.fill:
         share = (pooled.trust / config.full_trust).clamp(0, 1)
+        if surface.face is not None:
+            # Lids and lips have gaps that are none of the photo's: what they hide must not be painted over.
+            color, share = close_gaps(color, share, valid & (surface.face[0] < SIDE), GAP)
         if surface.mirror is not None:
             share = share * mirror_preference(pooled.trust, valid, surface.mirror)
         color = fill(color, share, valid, surface.mirror, regions=surface.regions, prior=surface.prior)

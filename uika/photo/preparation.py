@@ -13,6 +13,7 @@ from torch import Tensor
 
 from uika.errors import UikaWarning
 from uika.photo import matte
+from uika.photo.color_evidence import decided
 from uika.photo.crop import Square, coverage, pixel_centres, resample, to_crop, to_photo
 from uika.photo.detect import find_face
 from uika.photo.error import PhotoError
@@ -57,6 +58,7 @@ class Photo:
     focal length in crop pixels if the file tells it;
     bust, a wider crop if it was asked for.
     person: whether the face looks like a person's rather than, say, an animal's.
+    bounds: left, top, right and lower edge of the photo in crop pixels; the crop may reach beyond.
     """
 
     path: str
@@ -69,6 +71,7 @@ class Photo:
     focal: float | None = None
     bust: BustCrop | None = None
     person: bool = True
+    bounds: tuple[float, float, float, float] | None = None
 
 
 def prepare(
@@ -119,7 +122,14 @@ def prepare(
         focal=None if picture.focal is None else picture.focal * size / square[2],
         bust=_bust_crop(picture, rgb, square, face, size, plain) if bust else None,
         person=trust.person,
+        bounds=_bounds(rgb, square, size),
     )
+
+
+def _bounds(rgb: NDArray[np.uint8], square: Square, size: int) -> tuple[float, float, float, float]:
+    height, width = rgb.shape[:2]
+    (left, top), (right, low) = to_crop(np.array([[0.0, 0.0], [width, height]]), square, size).tolist()
+    return left, top, right, low
 
 
 def _bust_crop(
@@ -194,7 +204,7 @@ def _matte(crop: NDArray[np.uint8], landmarks: NDArray[np.float64], inside: NDAr
         first = seen[0] + (step if seen[0] > 0 else 0)
         last = seen[-1] - (step if seen[-1] < size - 1 else 0)
         rough = rough.take(np.arange(size).clip(first, last), axis=axis)
-    return matte.solve(crop, matte.trimap(rough, sure))
+    return matte.solve(crop, decided(matte.trimap(rough, sure), crop, rough, sure, inside))
 
 
 def _merge(

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from uika.avatar import Avatar
 from uika.head import HeadModel
-from uika.head.rotations import matrices_to_quaternions
+from uika.photo_splats.footprints import footprints
 from uika.photo_splats.layers import SPREAD, Layers, PhotoView, missing, opacities
 from uika.photo_splats.volume import agreed_depth, carved, half_thickness, unprojected
 
@@ -26,7 +26,6 @@ __all__ = ["LIMIT", "PhotoView", "with_photo_splats"]
 LIMIT = 36_000  # splats by default: with a bust, the file is half as large again as the head's alone
 RISE = 0.002  # metres by which splats of the outermost hair lie before the surface
 BEHIND = 0.004  # metres by which others lie behind its thin edge
-LONGEST = 4.0  # length along the view over width of a splat, where the round body is steep
 LEAST_OPACITY = 0.03
 NAPE = 24  # triangles that carry what lies below a head without bust
 SEEN_WELL = 0.45  # cosine from which another photo sees the surface well enough to need no rim of this one
@@ -144,7 +143,7 @@ def _of_photo(
         pick = torch.zeros_like(chosen)
         pick[step // 2 :: step, step // 2 :: step] = True
         pick &= ((own.distance > 0) & own.outside & own.hair & (half > RISE)) if far else chosen
-        result.append(_made(head, canonical, carriers, view, own, pick, at, half, step, [m for m, _ in others]))
+        result.append(_made(head, canonical, carriers, view, own, pick, at, step, [m for m, _ in others]))
     return result
 
 
@@ -156,7 +155,6 @@ def _made(
     own: Layers,
     pick: Tensor,
     depth: Tensor,
-    half: Tensor,
     step: int,
     others: Sequence[PhotoView],
 ) -> _Splats:
@@ -178,14 +176,11 @@ def _made(
     triangle = torch.empty(len(points), dtype=torch.int64)
     for at, carrier in ((hair, carriers[0]), (~hair, carriers[1])):
         triangle[at] = carrier[torch.from_numpy(cKDTree(middle[carrier].numpy()).query(points[at].numpy())[1])]
-    size = spread * own.depth[row, column] / view.camera.K[0, 0]
-    slope = own.distance[row, column] * own.depth[row, column] / view.camera.K[0, 0] / half[row, column].clamp_min(1e-6)
-    long = torch.where(own.distance[row, column] > 0, slope.clamp(1, LONGEST), 1.0)
-    rotation = view.camera.viewmat[:3, :3].mT
+    quats, scales = footprints(view, depth, own.outside + 2 * own.rim + 4 * own.hair, row, column, spread)
     return _Splats(
         means=canonical[head.faces[triangle]].mean(1) + points - middle[triangle],
-        quats=matrices_to_quaternions(rotation[None]).expand(len(points), 4).contiguous(),
-        scales=torch.stack((size, size, size * long), -1),
+        quats=quats,
+        scales=scales,
         opacities=opacity[keep],
         colors=color[:, cell[0], cell[1]].mT[keep],
         triangle=triangle,

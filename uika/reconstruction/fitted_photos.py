@@ -127,7 +127,10 @@ def fit_prepared(
                 shown = torch.stack([photo.image for photo in photos]), torch.stack([photo.matte for photo in photos])
                 marks = surface_marks(loaded.sight, head, *shown)
             found = [each.hair for each in ordered]
-            fit = fit_photos(photos, head, found, images=pictures, focals=focals, known=known, marks=marks)
+            bounds = [photo.bounds for photo in photos]
+            fit = fit_photos(
+                photos, head, found, images=pictures, focals=focals, known=known, marks=marks, bounds=bounds
+            )
     pairs = [(photo.image, photo.matte) for photo in photos]
     if loaded is not None and loaded.released is not None:
         pairs = [released_view(photo) for photo in photos]

@@ -2,7 +2,7 @@
 
 from uika.uv.aggregation import Aggregate, aggregate, pool
 from uika.uv.filling import diffuse, fill
-from uika.uv.holes import close_holes
+from uika.uv.holes import close_gaps, close_holes
 from uika.uv.mirroring import mirror_preference
 from uika.uv.reprojection import Sums, accumulate, accumulate_sizes, reproject, view_images
 
@@ -12,6 +12,7 @@ __all__ = [
     "accumulate",
     "accumulate_sizes",
     "aggregate",
+    "close_gaps",
     "close_holes",
     "diffuse",
     "fill",

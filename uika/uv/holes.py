@@ -32,6 +32,20 @@ def close_holes(values: Tensor, weight: Tensor, valid: Tensor | None = None, rad
     return torch.where(hole, closed, values), torch.where(hole, mean_weight, weight)
 
 
+@torch.no_grad()
+def close_gaps(values: Tensor, weight: Tensor, valid: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """`close_holes` for gaps alone: what lies beyond the border of all that was seen stays unseen.
+
+    Arguments and results as those of `close_holes`; a gap is what a morphological closing by `radius` fills.
+    """
+    seen = (weight > 0).to(values.dtype)
+    reach = 2 * radius + 1
+    grown = functional.max_pool2d(seen, reach, 1, radius)
+    inside = -functional.max_pool2d(-grown, reach, 1, radius) > 0
+    closed, share = close_holes(values, weight, valid, radius)
+    return torch.where(inside, closed, values), torch.where(inside, share, weight)
+
+
 def _blur(maps: Tensor, radius: int) -> Tensor:
     """Separable Gaussian of sigma radius/2 cut at `radius`, zeros outside the map."""
     weights = [math.exp(-2 * (offset / radius) ** 2) for offset in range(-radius, radius + 1)]
