@@ -170,3 +170,44 @@ def test_mattes_of_another_size_are_refused(head: HeadModel) -> None:
     camera = look_at(0.0, 0.0, 1.0, size=SIZE)
     with pytest.raises(ValueError, match="mattes"):
         pixel_uv(fitted(head, camera), head, torch.ones(1, SIZE, SIZE // 2))
+
+
+def test_hair_that_the_photo_cuts_goes_on_beyond_it(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, fov_y=24.0, size=SIZE)
+    grown = head.template + 0.03 * head.masks["scalp"][:, None] * normals_of(head.template, head.faces)
+    matte = covered(head, grown, camera).float()
+    edge = int((matte > 0.5).any(1).nonzero()[0]) + 22
+    cut = matte.clone()
+    cut[:edge] = 0.0
+    bounds = torch.tensor([[0.0, float(edge), float(SIZE), float(SIZE)]])
+    where = HeadParameters.zeros(head, 1), Camera.stack([camera])
+    tops = []
+    for given, edges in ((matte, None), (cut, bounds), (cut, None)):
+        offset = fit_hair(head, *where, given[None], edges)
+        tops.append(float((head.template + offset)[:, 1].max()))
+    assert abs(tops[1] - tops[0]) < 0.008
+    assert tops[2] < tops[0] - 0.012  # without knowing of the edge, the skull is pressed flat
+
+
+def test_hair_hangs_on_the_side_where_the_photo_shows_it(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, fov_y=26.0, size=SIZE)
+    lift = 0.01 * head.masks["scalp"][:, None] * torch.nn.functional.normalize(head.template, dim=-1)
+    left = (head.template[:, :1] > 0.0).float()
+    truth = head.template + left * curtain(head, head.template, -0.15) + lift
+    offset = fit_hair(
+        head, HeadParameters.zeros(head, 1), Camera.stack([camera]), covered(head, truth, camera)[None].float()
+    )
+    aside = head.template[:, 0].abs() > 0.06
+    low = [float(offset[aside & (sign * head.template[:, 0] > 0), 1].min()) for sign in (1, -1)]
+    assert low[0] < -0.08 and low[1] > -0.05
+
+
+def test_what_no_photo_shows_is_no_thicker_than_the_sides(head: HeadModel) -> None:
+    camera = look_at(0.0, 0.0, 1.0, fov_y=26.0, size=SIZE)
+    bun = ((head.template[:, 1] - 0.06) / 0.06).clamp(0, 1) * head.masks["scalp"]
+    grown = head.template + (0.005 + 0.05 * bun)[:, None] * torch.nn.functional.normalize(head.template, dim=-1)
+    offset = fit_hair(
+        head, HeadParameters.zeros(head, 1), Camera.stack([camera]), covered(head, grown, camera)[None].float()
+    )
+    back = (head.template[:, 2] < -0.11) & (head.template[:, 1] > 0.0) & (head.template[:, 1] < 0.06)
+    assert offset[back].norm(dim=-1).mean() < 0.02

@@ -14,6 +14,7 @@ DEFAULT = 0.5  # grey level where nothing of a kind was seen
 SEEN = 0.5  # share of the observation from which a texel tells a colour
 LEAST = 60  # texels that tell one
 APART = 0.1  # sRGB distance between hair and skin below which all of the scalp is one kind: a bald head, or fair hair
+ALIKE = 0.1  # sRGB distance up to which a colour is like another
 LEAST_SHARE = 0.1  # of the seen scalp that must be hair; less is a shadow on a bald head
 BINS = 64
 TEMPLES, CROWN, LOW_TRUST = 0.03, 0.09, 0.2  # metres between which hair gains trust: low, ears and neck are about
@@ -62,10 +63,11 @@ def kinds(
 
 
 def like_first(color: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """How much more colours [M,3] are like the first [3] than like the second [3], in [0,1]; 0 where those agree."""
+    """How far colours [M,3] are like the first [3] and unlike the second [3], in [0,1]; 0 where those two agree."""
     one, other = (color - first).norm(dim=-1), (color - second).norm(dim=-1)
     share = other / (one + other).clamp_min(1e-6)
-    return ((share - 0.5) / 0.2).clamp(0, 1) * ((first - second).norm() / APART).clamp(0, 1)
+    alike = ((share - 0.5) / 0.2).clamp(0, 1) * ((first - second).norm() / APART).clamp(0, 1)
+    return alike * (2 - one / ALIKE).clamp(0, 1)
 
 
 def texel_areas(head: HeadModel, binding: Binding) -> Tensor:

@@ -20,7 +20,7 @@ from uika.head.mesh_parts import tongue
 _HAIR_DEPTH = 0.012  # metres that hair stands off the scalp where it surely is hair
 _BARE = 0.1  # hairiness up to which the face counts as bare skin
 _SOURCE = 30.0  # pull of a fully seen vertex towards its own colour, relative to an edge
-_KIND_PULL = 0.1  # pull of every vertex towards the typical colour of its kind, skin or hair
+_SKIN_PULL, _HAIR_PULL = 0.1, 0.5  # pull of every vertex towards the typical colour of its kind
 _SEEN = 0.8  # share of the observation from which a texel lends its strands
 
 
@@ -61,7 +61,10 @@ def prior_colors(
     if bool((ears > 0.5).any()):
         on_ear = at_texels(head, binding, ears[:, None])[:, 0] * everywhere * (like_first(observed, skin, strand) > 0.5)
         kind = torch.lerp(kind, weighted_median(observed, on_ear, skin), ears[:, None])
-    result = at_texels(head, binding, _continue(head, at_vertices, share, kind))
+    draw = _SKIN_PULL + (_HAIR_PULL - _SKIN_PULL) * hair
+    supposed = _continue(head, at_vertices, share, kind, draw)
+    # Hair around an ear lends it nothing.
+    result = at_texels(head, binding, torch.lerp(supposed, kind, ears[:, None]))
     strands = (seen > _SEEN) & (hairy > 0.5) & (like_first(observed, skin, strand) < 0.5)
     result = (result + hairy[:, None] * grain(points, observed - result, strands)).clamp(0, 1)
     # No skin may appear where lids and lips open.
@@ -103,8 +106,8 @@ def _hairiness(head: HeadModel, static_offset: Tensor) -> Tensor:
     return hair * ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1)
 
 
-def _continue(head: HeadModel, color: Tensor, seen: Tensor, kind: Tensor) -> Tensor:
-    """Harmonic continuation [V,3] of vertex colours over the mesh from where they were seen, drawn to `kind` [V,3]."""
+def _continue(head: HeadModel, color: Tensor, seen: Tensor, kind: Tensor, draw: Tensor) -> Tensor:
+    """Harmonic continuation [V,3] of seen vertex colours over the mesh, drawn to `kind` [V,3] by `draw` [V]."""
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import splu
 
@@ -113,6 +116,7 @@ def _continue(head: HeadModel, color: Tensor, seen: Tensor, kind: Tensor) -> Ten
     graph = coo_matrix((np.ones(len(row)), (row, column)), shape=(count, count))
     graph = (graph + graph.T).tocsr()
     pull = _SOURCE * (2 * seen - 1).clamp_min(0).double().numpy()[:, None]
-    system = diags(np.asarray(graph.sum(1)).ravel() + pull[:, 0] + _KIND_PULL) - graph
-    solved = splu(system.tocsc()).solve(pull * color.double().numpy() + _KIND_PULL * kind.double().numpy())
+    hold = draw.double().numpy()[:, None]
+    system = diags(np.asarray(graph.sum(1)).ravel() + pull[:, 0] + hold[:, 0]) - graph
+    solved = splu(system.tocsc()).solve(pull * color.double().numpy() + hold * kind.double().numpy())
     return torch.from_numpy(solved).float().clamp(0, 1)

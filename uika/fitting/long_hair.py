@@ -27,7 +27,7 @@ STANDING = 0.97  # the curtain's radii relative to the skull's largest
 FULL = 0.35  # share of the fall after which the curtain stands off fully
 SIDE = 96  # pixels of the pictures in which it is compared
 LEAST = 0.01  # of the head's area that must be won
-BACKED = 0.55  # share of a side's curtain that the mattes must show
+ONE_SIDED = 0.01  # of it that must be won by not hanging on one side
 MIDDLE = 0.05  # metres from the head's middle plane where its sides begin
 
 
@@ -44,37 +44,18 @@ def hanging_hair(head: HeadModel, vertices: Tensor, cameras: Camera, mattes: Ten
     cameras, small = _smaller(cameras, mattes)
     bands = [_below_lobes(head, cameras[n]) for n in range(len(vertices))]
     bald = [_covered(head, vertices[n], cameras[n]) for n in range(len(vertices))]
+    x = head.template[:, :1]
+    sides = (torch.ones_like(x), 1 - _ramp(-x, 0.0, MIDDLE), 1 - _ramp(x, 0.0, MIDDLE))
     for end in ENDS:
-        offset = curtain(head, vertices[0], end)
-        won = 0.0
-        for n in range(len(vertices)):
-            added = _covered(head, vertices[n] + offset, cameras[n]) & ~bald[n] & bands[n]
-            won += float((2 * small[n] - 1)[added].sum() / bald[n].sum().clamp(min=1))
-        if won / len(vertices) > most:
-            best, most = offset, won / len(vertices)
-    return best if not bool((best != 0).any()) else best * _sides(head, vertices, best, cameras, small, bald, bands)
-
-
-def _sides(
-    head: HeadModel,
-    vertices: Tensor,
-    offset: Tensor,
-    cameras: Camera,
-    mattes: Tensor,
-    bald: list[Tensor],
-    bands: list[Tensor],
-) -> Tensor:
-    """Shares [V,1] of the curtain that stay: none on a side of the head where it would hang in the background."""
-    share = torch.ones(len(head.template), 1)
-    for sign in (1.0, -1.0):
-        side = _ramp(sign * head.template[:, 0], 0.0, MIDDLE)[:, None]
-        shown, total = 0.0, 0.0
-        for n in range(len(vertices)):
-            added = _covered(head, vertices[n] + side * offset, cameras[n]) & ~bald[n] & bands[n]
-            shown, total = shown + float(mattes[n][added].sum()), total + float(added.sum())
-        if shown < BACKED * total:
-            share = share * (1 - side)
-    return share
+        whole = curtain(head, vertices[0], end)
+        for n_side, share in enumerate(sides):
+            won = -ONE_SIDED if n_side else 0.0
+            for n in range(len(vertices)):
+                added = _covered(head, vertices[n] + share * whole, cameras[n]) & ~bald[n] & bands[n]
+                won += float((2 * small[n] - 1)[added].sum() / bald[n].sum().clamp(min=1)) / len(vertices)
+            if won > most:
+                best, most = share * whole, won
+    return best
 
 
 def overlap(head: HeadModel, vertices: Tensor, cameras: Camera, mattes: Tensor) -> float:

@@ -73,9 +73,11 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
     solid = shown.alpha > SOLID
     away, nearest = distance_transform_edt(~solid.numpy(), return_indices=True)
     row, column = torch.from_numpy(nearest).long()
-    hair = view.matte - view.hair < CLOTH
+    hair = _head_parts(view)
     away = torch.from_numpy(away).float()
     if head.bust is not None and bool((worn := solid & (triangle >= head.bust.face)).any()):
+        # Hair that lies on the shoulders stays there when the head turns.
+        hair &= ~worn[row, column] | solid
         # A collar beside the jaw lies where the shoulders do, not where the jaw does.
         far, below = distance_transform_edt(~worn.numpy(), return_indices=True)
         row, column = (
@@ -107,6 +109,18 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
         distance=away,
         triangle=triangle,
     )
+
+
+def _head_parts(view: PhotoView) -> Tensor:
+    """Pixels [S,S] that show parts of the head rather than clothes; thin ones as their nearest solid one."""
+    from scipy.ndimage import distance_transform_edt
+
+    solid = view.matte > 0.5
+    hair = view.matte - view.hair < CLOTH
+    if not bool(solid.any()):
+        return hair
+    row, column = torch.from_numpy(distance_transform_edt(~solid.numpy(), return_distances=False, return_indices=True))
+    return hair[row.long(), column.long()]
 
 
 def opacities(coverage: Tensor, spread: float, stride: int) -> Tensor:
