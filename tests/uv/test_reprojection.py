@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from uika.uv import accumulate, aggregate, close_holes, reproject
+from uika.uv import accumulate, aggregate, close_gaps, close_holes, reproject
 
 
 def identity_uv(size: int) -> torch.Tensor:
@@ -171,3 +171,15 @@ def test_bad_arguments_are_named() -> None:
         aggregate(**data, size=8, normalization="mean")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="radius must be"):
         close_holes(torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4), radius=0)
+
+
+def test_gaps_close_and_the_border_stays() -> None:
+    rows = torch.zeros(1, 1, 24, 24)
+    rows[:, :, 6:19:3, 4:20] = 0.8
+    values = torch.full((1, 3, 24, 24), 0.3) * (rows > 0)
+    closed, share = close_gaps(values, rows, torch.ones(24, 24, dtype=torch.bool), 3)
+    inside = torch.zeros(24, 24, dtype=torch.bool)
+    inside[6:19, 4:20] = True
+    assert (share[0, 0][inside] > 0.79).all() and (share[0, 0][~inside] == 0).all()
+    assert (closed[0, :, inside] - 0.3).abs().max() < 1e-5
+    assert (closed[0, :, ~inside] == 0).all()
