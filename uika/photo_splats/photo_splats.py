@@ -27,6 +27,7 @@ LIMIT = 36_000  # splats by default: with a bust, the file is half as large agai
 RISE = 0.002  # metres by which splats of the outermost hair lie before the surface
 BEHIND = 0.004  # metres by which others lie behind its thin edge
 LEAST_OPACITY = 0.03
+CLEAR = 0.03  # metres around the face that clothes leave free
 NAPE = 24  # triangles that carry what lies below a head without bust
 SEEN_WELL = 0.45  # cosine from which another photo sees the surface well enough to need no rim of this one
 NECK = (0.0, -0.10, -0.075)  # metres in the head's axes: middle of the neck above the shoulders
@@ -170,7 +171,9 @@ def _made(
     points = unprojected(view, depth)[row, column]
     hair = own.hair[row, column]
     opacity = carved(points, dense[cell], hair, others)
-    keep = opacity > LEAST_OPACITY
+    skin = own.vertices[: len(head.masks["face"])][head.masks["face"] > 0.5]
+    near = torch.from_numpy(cKDTree(skin.numpy()).query(points.numpy(), distance_upper_bound=CLEAR)[0])
+    keep = (opacity > LEAST_OPACITY) & (hair | near.isinf())
     row, column, points, hair = row[keep], column[keep], points[keep], hair[keep]
     middle = own.vertices[head.faces].mean(1)
     triangle = torch.empty(len(points), dtype=torch.int64)
