@@ -263,7 +263,7 @@ def _membrane(region: _Region, height: Tensor, wanted: Tensor, pull: Tensor, hid
     target = (height[region.vertices] + wanted).clamp(max=MAX_OFFSET).maximum(region.lowest).double().numpy()
     stiff = FACE_PULL * (1.0 / region.share.double().clamp(min=0.02).numpy() - 1.0)
     # What no outline shows would go on rising behind: it is drawn to the thickness of the hair at the sides.
-    aside = (pull > 0) & region.sides
+    aside = (pull > UNTRUSTED) & region.sides
     usual = float((height[region.vertices] + wanted)[aside].clamp(0, MAX_USUAL).median()) if bool(aside.any()) else 0.0
     back = (BACK_PULL * hidden[region.vertices] * region.share).double().numpy()
     system = (region.smoothness + sparse.diags(weight + back + REST_PULL + stiff)).tocsc()
