@@ -37,7 +37,7 @@ def test_closed_pixels_are_off_by_a_level_at_most(head: HeadModel, avatar: Avata
 def test_bytes_are_those_of_the_differentiable_way(head: HeadModel, avatar: Avatar) -> None:
     motion = _moving(head, 18)
     background = (0.2, 0.4, 0.6)
-    pictures = list(film(avatar, motion, head=head, background=background, size=SIZE, closing=0))
+    pictures = list(film(avatar, motion, head=head, background=background, size=SIZE, closing=0, level="full"))
     assert len(pictures) == 18
     for picture, frame in zip(pictures, frames(avatar, motion, None, head, background, size=SIZE), strict=True):
         assert picture.shape == (SIZE, SIZE, 3) and picture.dtype == np.uint8

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.avatar.framing import Framing, motion_cameras
+from uika.avatar.level import Level, at_level
 from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices
 from uika.head.binding import rigid_turn
 from uika.head.posing import rest_joints
@@ -113,6 +114,7 @@ def film(
     *,
     size: int = 512,
     closing: float | None = None,
+    level: Level = "auto",
     frame: Framing = "bust",
     progress: bool = False,
 ) -> Iterator[NDArray[np.uint8]]:
@@ -129,6 +131,7 @@ def film(
         background: sRGB in [0,1].
         size: side of the picture in pixels when `cameras` is None.
         closing: transmittance at which a pixel is closed; None is one grey level at most, 0 leaves nothing out.
+        level: `half` draws half as many, larger Gaussians; `auto` does so where they are smaller than a pixel.
         frame: what is framed then, as in `neutral_camera`.
         progress: whether to show a progress bar on stderr.
 
@@ -140,8 +143,9 @@ def film(
         RuntimeError: no LLVM library was found for Dr.Jit; the message says what to install.
     """
     model = load_head() if head is None else head
-    renderer = FrameRenderer(avatar, model, background, closing)
+    avatar.check_head(model)
     path = motion_cameras(avatar, motion, size, frame) if cameras is None else cameras
+    renderer = FrameRenderer(at_level(avatar, level, path[0]), model, background, closing)
     params = motion.parameters(avatar.identity)
     last: Frame | None = None
     for index in counted(range(len(motion)), progress, len(motion), "frames"):

@@ -55,6 +55,8 @@ class Animate:
     """Else 25, or the motion's own."""
     frame: Literal["bust", "head"] = "bust"
     """Portrait with shoulders, or head."""
+    level: Literal["auto", "full", "half"] = "auto"
+    """half: half as many Gaussians; auto: in small films."""
     watermark: bool = True
     """Invisible; `uika verify` finds it."""
 
@@ -91,7 +93,7 @@ class Animate:
             motion = self._tracked(self.video, head)
             if self.save_motion is not None:
                 write_motion(motion, self.save_motion, head)
-        pictures = film(avatar, motion, head=head, size=self.size, frame=self.frame, progress=True)
+        pictures = film(avatar, motion, head=head, size=self.size, frame=self.frame, level=self.level, progress=True)
         marked = map(mark, pictures) if self.watermark else pictures
         provenance = picture_provenance(avatar, watermark=self.watermark)
         count = write_video(target, marked, motion.fps, provenance, sound)
