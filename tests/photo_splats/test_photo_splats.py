@@ -129,3 +129,42 @@ def test_hair_follows_the_scalp_and_clothes_do_not_follow_the_jaw(avatar: Avatar
         way = result.pose(moved, head)[0] - result.pose(still, head)[0]
         far = (way[len(avatar) :].norm(dim=-1) > 0.005).float().mean()
         assert abs(far - share) < 0.25  # the neck's own edge moves with the jaw
+
+
+def test_photos_agree_on_how_wide_hair_is(avatar: Avatar, head: HeadModel) -> None:
+    avatar = replace(avatar, colors=torch.tensor([0.8, 0.6, 0.5]).expand(len(avatar), 3))
+    crown = float(avatar.means[:, 1].max())
+    before = float(avatar.means[(avatar.means[:, 1] - crown + 0.02).abs() < 0.003, 2].max())
+    middle = torch.tensor([0.0, crown - 0.02, before + 0.012])
+    lock = middle + torch.cartesian_prod(*(torch.arange(-half, half, 0.003) for half in (0.045, 0.015, 0.015)))
+    truth = grown(avatar, head, lock)
+    rest = HeadParameters.zeros(head).replace(identity=avatar.identity)
+
+    def view(yaw: float) -> PhotoView:
+        camera = neutral_camera(avatar, yaw, 0.0, SIZE)
+        shown = render(truth, rest, camera, head)
+        return PhotoView(rest, camera, shown.rgb.permute(2, 0, 1).clamp(0, 1), shown.alpha, shown.alpha)
+
+    held = neutral_camera(avatar, -35.0, 0.0, SIZE)
+    there = render(truth, rest, held, head).alpha - render(avatar, rest, held, head).alpha > 0.5
+    result = with_photo_splats(avatar, head, [view(80.0), view(15.0)])
+    shown = render(result, rest, held, head)
+    assert int(there.sum()) > 200
+    assert shown.alpha[there].mean() > 0.95
+    assert (shown.rgb[there] - GREEN).abs().mean() < 0.05
+
+
+def grown(avatar: Avatar, head: HeadModel, points: Tensor) -> Avatar:
+    """The avatar with small green splats at points [M,3]."""
+    count = len(points)
+    scalp = int((head.masks["scalp"][head.faces].sum(-1)).argmax())
+    return replace(
+        avatar,
+        means=torch.cat((avatar.means, points)),
+        quats=torch.cat((avatar.quats, torch.eye(4)[:1].expand(count, 4))),
+        scales=torch.cat((avatar.scales, torch.full((count, 3), 0.002))),
+        opacities=torch.cat((avatar.opacities, torch.full((count,), 0.95))),
+        colors=torch.cat((avatar.colors, GREEN.expand(count, 3))),
+        triangle=torch.cat((avatar.triangle, torch.full((count,), scalp))),
+        barycentric=torch.cat((avatar.barycentric, torch.full((count, 3), 1 / 3))),
+    )

@@ -8,7 +8,7 @@ body below, so that it moves along and can be looked at from the side.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -17,9 +17,10 @@ from torch.nn import functional
 
 from uika.avatar import Avatar
 from uika.head import HeadModel
+from uika.head.rotations import matrices_to_quaternions
 from uika.photo_splats.footprints import footprints
 from uika.photo_splats.layers import SPREAD, Layers, PhotoView, missing, opacities
-from uika.photo_splats.volume import agreed_depth, carved, half_thickness, unprojected
+from uika.photo_splats.volume import APART, agreed_depth, agreed_volume, carved, half_thickness, unprojected
 
 __all__ = ["LIMIT", "PhotoView", "with_photo_splats"]
 
@@ -28,6 +29,9 @@ RISE = 0.002  # metres by which splats of the outermost hair lie before the surf
 BEHIND = 0.004  # metres by which others lie behind its thin edge
 LEAST_OPACITY = 0.03
 CLEAR = 0.03  # metres around the face that clothes leave free
+VOLUME_STEP = 3  # pixels between splats inside hair that several photos agree on
+VOLUME_OPACITY = 0.5  # of each: several lie behind one another
+VOLUME_SHARE = 0.25  # of all splats at most
 NAPE = 24  # triangles that carry what lies below a head without bust
 SEEN_WELL = 0.45  # cosine from which another photo sees the surface well enough to need no rim of this one
 NECK = (0.0, -0.10, -0.075)  # metres in the head's axes: middle of the neck above the shoulders
@@ -59,7 +63,7 @@ def with_photo_splats(avatar: Avatar, head: HeadModel, views: Sequence[PhotoView
     several = len(views) > 1
     layers = [missing(avatar, head, view, clothes=n == front, relit=several) for n, view in enumerate(views)]
     chosen = [_chosen(head, layers, views, n) for n in range(len(views))]
-    stride = _stride(chosen, limit)
+    stride = _stride(chosen, round((1 - VOLUME_SHARE) * limit) if several else limit)
     canonical = avatar.canonical_vertices(head)
     carriers = _carriers(head)
     parts = [
@@ -67,6 +71,8 @@ def with_photo_splats(avatar: Avatar, head: HeadModel, views: Sequence[PhotoView
         for n in range(len(views))
         for part in _of_photo(head, canonical, carriers, views, layers, n, chosen[n], stride)
     ]
+    if several:
+        parts += _volume(head, canonical, carriers[0], views, layers, round(VOLUME_SHARE * limit))
     if not sum(len(part.means) for part in parts):
         return avatar
 
@@ -148,6 +154,50 @@ def _of_photo(
     return result
 
 
+def _volume(
+    head: HeadModel,
+    canonical: Tensor,
+    carrier: Tensor,
+    views: Sequence[PhotoView],
+    layers: Sequence[Layers],
+    limit: int,
+) -> list[_Splats]:
+    """Splats inside the hair that several photos agree on."""
+    result = []
+    for n, (view, own) in enumerate(zip(views, layers, strict=True)):
+        pick = torch.zeros_like(own.outside)
+        pick[VOLUME_STEP // 2 :: VOLUME_STEP, VOLUME_STEP // 2 :: VOLUME_STEP] = True
+        pick &= own.outside & own.hair & (own.distance > 0) & (own.coverage > 0.5)
+        others = [(views[m], layers[m]) for m in range(len(views)) if m != n]
+        points, colors = agreed_volume(own, pick, view, others)
+        middle = own.vertices[head.faces].mean(1)
+        triangle = _nearest(carrier, middle, points)
+        depth = (points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3])[:, None]
+        wide = SPREAD * VOLUME_STEP * depth / view.camera.K[0, 0]
+        rotation = view.camera.viewmat[:3, :3].mT
+        result.append(
+            _Splats(
+                means=canonical[head.faces[triangle]].mean(1) + points - middle[triangle],
+                quats=matrices_to_quaternions(rotation[None]).expand(len(points), 4).contiguous(),
+                scales=torch.cat((wide, wide, torch.full_like(wide, SPREAD * APART)), -1),
+                opacities=torch.full((len(points),), VOLUME_OPACITY),
+                colors=colors,
+                triangle=triangle,
+            )
+        )
+    every = -(-sum(len(part.means) for part in result) // limit)
+    if every > 1:
+        result = [_Splats(**{f.name: getattr(part, f.name)[::every] for f in fields(part)}) for part in result]
+    return result
+
+
+def _nearest(carrier: Tensor, middle: Tensor, points: Tensor) -> Tensor:
+    """Of the triangles `carrier` [A] with their middles in `middle` [F,3], those [M] next to points [M,3]."""
+    from scipy.spatial import cKDTree
+
+    return carrier[torch.from_numpy(cKDTree(middle[carrier].numpy()).query(points.numpy())[1])]
+
+
 def _made(
     head: HeadModel,
     canonical: Tensor,
@@ -178,7 +228,7 @@ def _made(
     middle = own.vertices[head.faces].mean(1)
     triangle = torch.empty(len(points), dtype=torch.int64)
     for at, carrier in ((hair, carriers[0]), (~hair, carriers[1])):
-        triangle[at] = carrier[torch.from_numpy(cKDTree(middle[carrier].numpy()).query(points[at].numpy())[1])]
+        triangle[at] = _nearest(carrier, middle, points[at])
     quats, scales = footprints(view, depth, own.outside + 2 * own.rim + 4 * own.hair, row, column, spread)
     return _Splats(
         means=canonical[head.faces[triangle]].mean(1) + points - middle[triangle],

@@ -1,4 +1,8 @@
-"""How deep what lies outside the surface is: one photo tells only its outline, several agree or do not."""
+"""How deep what lies outside the surface is: one photo tells only its outline, several agree or do not.
+
+Hair that hangs over a forehead is as wide as the forehead. A photo from the side shows how far it stands off, but not
+how wide it is; photos from the front say where there is hair in front of the skin.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,8 @@ CANDIDATES = 9  # depths tried
 WINDOW = 7  # pixels over which photos are compared
 COLOR_SPREAD = 0.12  # sRGB; light differs between photos
 DECISIVE = 0.15  # score by which the best depth must beat the one supposed
+REACH, APART = 0.08, 0.01  # metres before and behind the outline that are searched for hair, and between its splats
+AGREED = 0.5  # likeness from which a photo confirms hair
 HIDDEN = 0.01  # metres behind another photo's surface from which a point is not seen there
 
 
@@ -50,13 +56,47 @@ def agreed_depth(layers: Layers, half: Tensor, view: PhotoView, others: Sequence
         points = _world(view, rays * (layers.depth + shift)[..., None])
         total, count = torch.zeros(size, size), torch.zeros(size, size)
         for other, surface in others:
-            score, known = _likeness(layers.color, points, other, surface)
+            score, known, _ = _likeness(layers.color, points, other, surface)
             total, count = total + score * known, count + known
         mean = _box(total * layers.outside) / _box(count * layers.outside).clamp_min(1e-6)
         scores.append(torch.where(_box(count * layers.outside) > 0, mean, 0.0))
     supposed = scores.pop()
     best, index = torch.stack(scores).max(0)
     return torch.where(best > supposed + DECISIVE, span[index], front)
+
+
+def agreed_volume(
+    layers: Layers, pick: Tensor, view: PhotoView, others: Sequence[tuple[PhotoView, Layers]]
+) -> tuple[Tensor, Tensor]:
+    """What several photos agree to be hair along the rays of a photo's pixels.
+
+    Args:
+        layers: of the photo.
+        pick: [S,S] pixels, P of them True.
+        view: the photo.
+        others: the other photos with their layers.
+
+    Returns:
+        Points [M,3] in space that no photo contradicts and at least one confirms, and their colours [M,3], which are
+        those of the most frontal photo that shows them.
+    """
+    row, column = torch.nonzero(pick, as_tuple=True)
+    steps = torch.arange(-REACH, REACH + APART / 2, APART)
+    depth = layers.depth[row, column][:, None] + steps
+    points = _world(view, _rays(view, len(pick))[row, column][:, None] * depth[..., None])
+    own = layers.color[:, row, column][..., None]
+    color, facing = own.expand(3, *depth.shape), torch.full_like(depth, -float(view.camera.viewmat[2, 2]))
+    confirmed, denied = torch.zeros_like(depth, dtype=torch.bool), torch.zeros_like(depth, dtype=torch.bool)
+    for other, surface in others:
+        score, known, seen = _likeness(own, points, other, surface)
+        alike = (known > 0) & (score > AGREED)
+        confirmed |= alike
+        denied |= (known > 0) & ~alike
+        towards = -float(other.camera.viewmat[2, 2])
+        color = torch.where(alike & (facing < towards), seen, color)
+        facing = torch.where(alike, facing.clamp_min(towards), facing)
+    agreed = confirmed & ~denied
+    return points[agreed], color.permute(1, 2, 0)[agreed]
 
 
 def carved(points: Tensor, opacity: Tensor, hair: Tensor, others: Sequence[PhotoView]) -> Tensor:
@@ -78,8 +118,8 @@ def carved(points: Tensor, opacity: Tensor, hair: Tensor, others: Sequence[Photo
     return opacity
 
 
-def _likeness(color: Tensor, points: Tensor, other: PhotoView, surface: Layers) -> tuple[Tensor, Tensor]:
-    """How well points [S,S,3] fit another photo [S,S] in [0,1], and whether it can tell [S,S]."""
+def _likeness(color: Tensor, points: Tensor, other: PhotoView, surface: Layers) -> tuple[Tensor, Tensor, Tensor]:
+    """How well points [H,W,3] fit another photo [H,W] in [0,1], whether it can tell [H,W], and its colours [3,H,W]."""
     pixels, depth = project(points.flatten(0, 1), other.camera)
     grid = (2 * pixels / other.camera.width - 1).view(1, *points.shape[:2], 2)
     maps = torch.cat((surface.color, other.matte[None], surface.depth[None], (surface.triangle >= 0).float()[None]))
@@ -87,7 +127,7 @@ def _likeness(color: Tensor, points: Tensor, other: PhotoView, surface: Layers) 
     inside = (grid[0].abs() < 0.98).all(-1)
     hidden = (seen[5] > 0.5) & (depth.view_as(seen[4]) > seen[4] + HIDDEN)
     like = torch.exp(-(((color - seen[:3]) / COLOR_SPREAD) ** 2).mean(0))
-    return like * seen[3], (inside & ~hidden).float()
+    return like * seen[3], (inside & ~hidden).float(), seen[:3]
 
 
 def _rays(view: PhotoView, size: int) -> Tensor:
