@@ -5,9 +5,10 @@
 Every photo in FOLDER is a person of one photo, every folder in it a person of several. Each person's avatar is
 rendered at its photos' own cameras: PSNR in dB inside the matte of head and hair (`head`), inside the face's oval
 (`face`) and in the rest (`hair`), the overlap of silhouette and person (`iou`), and the mean distance of detected
-landmarks in % of that of the outer eye corners (`landmarks`). Only figures are written, under the first digits of
-the photos' hashes: whoever is shown need not have agreed to more. Exit status 1 if a mean has become worse by more
-than its tolerance, or somebody is refused who was not.
+landmarks in % of that of the outer eye corners (`landmarks`); in the wider crop that shows the shoulders, down to
+where the bust fades out, PSNR inside the person's matte (`person`) and the overlap (`person_iou`). Only figures are
+written, under the first digits of the photos' hashes: whoever is shown need not have agreed to more. Exit status 1
+if a mean has become worse by more than its tolerance, or somebody is refused who was not.
 """
 
 from __future__ import annotations
@@ -23,19 +24,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.errors import UikaError
-from uika.head import load_head
+from uika.head import Camera, HeadModel, HeadParameters, load_head, pose_vertices, project
+from uika.head.bust import FADE, cut_rim
 from uika.io.files import replacing
 from uika.photo import head_matte
 from uika.photo.networks import face_meshes
 from uika.photo.outline import OVAL, polygon
+from uika.photo.preparation import BustCrop
 from uika.reconstruction import Reconstruction, reconstruct
+from uika.reconstruction.bust import wider_camera
 
 Figures = dict[str, float]
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".heic"}
 # Name -> which direction is better, and how far a mean may fall behind before the gate closes.
-MEASURES = {"head": (1, 0.1), "face": (1, 0.1), "hair": (1, 0.1), "iou": (1, 0.002), "landmarks": (-1, 0.05)}
+MEASURES = {"head": (1, 0.1), "face": (1, 0.1), "hair": (1, 0.1), "iou": (1, 0.002), "landmarks": (-1, 0.05)} | {
+    "person": (1, 0.1),
+    "person_iou": (1, 0.002),
+}
 LEFT_CORNER, RIGHT_CORNER = 33, 263  # of the eyes, in the face mesh
 FEWEST = 200  # pixels that say something
 
@@ -149,8 +157,28 @@ def _photo_figures(result: Reconstruction, index: int) -> Figures:
     }
     person, covered = photo.matte > 0.5, shown.alpha > 0.5
     figures["iou"] = float((person & covered).sum() / (person | covered).sum().clamp_min(1))
+    figures |= (
+        {}
+        if photo.bust is None
+        else portrait_figures(
+            result.avatar, load_head(), fit.parameters[index], wider_camera(fit.cameras[index], photo), photo.bust
+        )
+    )
     distance = _landmark_percent(rgb, photo.landmarks)
     return figures if distance is None else {**figures, "landmarks": distance}
+
+
+def portrait_figures(avatar: Avatar, head: HeadModel, pose: HeadParameters, camera: Camera, crop: BustCrop) -> Figures:
+    """`person` and `person_iou` of an avatar with a bust in a wider crop, at its camera and in its pose."""
+    shown = render(avatar, pose, camera, head)
+    vertices = pose_vertices(head, pose.replace(identity=avatar.identity), avatar.static_offset)
+    rim, depth = project(vertices[cut_rim(head.template)], camera)
+    end = rim[:, 1].median() - FADE[1] * camera.K[1, 1] / depth.median()
+    shows = (crop.inside > 0.99) & (torch.arange(camera.height) + 0.5 < end)[:, None]
+    person, covered = (crop.matte > 0.5) & shows, (shown.alpha > 0.5) & shows
+    error = (crop.image.permute(1, 2, 0) - shown.rgb.clamp(0, 1)).square().mean(-1)[person].mean()
+    overlap = (person & covered).sum() / (person | covered).sum().clamp_min(1)
+    return {"person": float(-10 * error.clamp_min(1e-12).log10()), "person_iou": float(overlap)}
 
 
 def _landmark_percent(rgb: Tensor, landmarks: Tensor) -> float | None:

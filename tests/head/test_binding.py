@@ -12,6 +12,7 @@ from uika.head import (
     rodrigues,
     surface_frames,
     surface_points,
+    unpose_gaussians,
     uv_texels,
 )
 
@@ -135,3 +136,23 @@ def test_gradients_with_respect_to_vertices_are_exact() -> None:
         return pose_gaussians(centres, quats, scales, flat, vertices, faces, triangle, barycentric)
 
     assert torch.autograd.gradcheck(moved, (posed, means.requires_grad_()))
+
+
+def test_unposed_gaussians_are_posed_back(head: HeadModel) -> None:
+    generator = torch.Generator().manual_seed(3)
+    triangle = torch.randint(0, len(head.faces), (200,), generator=generator)
+    middle = torch.full((200, 3), 1 / 3)
+    params = HeadParameters.zeros(head).replace(
+        neck=torch.tensor([0.1, 0.6, -0.2]),
+        jaw=torch.tensor([0.2, 0.0, 0.0]),
+        translation=torch.tensor([0.1, 0.0, 0.3]),
+    )
+    rest, posed = pose_vertices(head, HeadParameters.zeros(head)), pose_vertices(head, params)
+    means = posed[head.faces[triangle]].mean(1) + 0.03 * torch.randn(200, 3, generator=generator)
+    quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=generator), dim=-1)
+    scales = torch.rand(200, 3, generator=generator) * 0.01
+    places = rest, posed, head.faces, triangle, middle
+    again = pose_gaussians(*unpose_gaussians(means, quats, scales, *places), *places)
+    torch.testing.assert_close(again[0], means, atol=1e-6, rtol=0)
+    torch.testing.assert_close(again[1], quats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again[2], scales, atol=1e-7, rtol=1e-5)

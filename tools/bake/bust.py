@@ -4,7 +4,6 @@ The head comes first and stays as it is: the bust hangs on the vertices of its l
 the sampled people tell, and has modes of its own for the rest.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from uika.head import HeadModel
 from uika.head.bust import BustArrays
+from uika.head_import.clip import clip
 
 from .sample import BATCH, SAMPLES, bone_weights, draw_people, run, y_up
 from .topology import PARTS, Head
@@ -27,23 +27,6 @@ TILE_MARGIN = 0.01
 CHIN = 152  # of the face mesh
 TORSO_BONES = ("root", "spine", "pelvis", "breast", "clavicle", "shoulder", "upperarm", "lowerarm", "wrist", "upperleg")
 ARM_BONES = ("upperarm", "lowerarm", "wrist", "finger", "metacarpal")
-
-
-@dataclass(frozen=True)
-class _Cut:
-    """Triangles of the body above a plane; new corners lie on edges of the body."""
-
-    one: np.ndarray  # [N] body vertices
-    other: np.ndarray  # [N]
-    share: np.ndarray  # [N] of the second one
-    faces: np.ndarray  # [F,3] into the N
-    uvs: np.ndarray  # [T,2]
-    uv_faces: np.ndarray  # [F,3]
-
-    def of(self, values: np.ndarray) -> np.ndarray:
-        """Values [...,N,C] of the body's [...,V,C]."""
-        share = self.share[:, None]
-        return (1 - share) * values[..., self.one, :] + share * values[..., self.other, :]
 
 
 def build_bust(head: Head, bones: list[str], model: HeadModel) -> BustArrays:
@@ -78,7 +61,7 @@ def build_bust(head: Head, bones: list[str], model: HeadModel) -> BustArrays:
         raise ValueError(f"the mean of the sampled bodies lies {off} m off the baked head")
     faces, uv_faces = _below(body.faces.numpy(), body.face_texture_coordinate_indices.numpy(), head, of_head)
     chin = model.landmarks(model.template)[model.landmark_ids.tolist().index(CHIN), 1].item()
-    cut = _clip(mean, faces, body.texture_coordinates.numpy(), uv_faces, chin - BELOW_CHIN)
+    cut = clip(mean[:, 1] - (chin - BELOW_CHIN), faces, body.texture_coordinates.numpy(), uv_faces)
 
     ids = np.full(len(neutral), -1)
     ids[place] = own
@@ -133,37 +116,6 @@ def _below(faces: np.ndarray, uv_faces: np.ndarray, head: Head, of_head: np.ndar
     count[np.setdiff1d(np.arange(len(count)), part[neck])] = 0
     largest = free & (part[faces[:, 0]] == count.argmax())
     return faces[largest], uv_faces[largest]
-
-
-def _clip(points: np.ndarray, faces: np.ndarray, uvs: np.ndarray, uv_faces: np.ndarray, level: float) -> _Cut:
-    """Cut triangles at the height `level` and keep what lies above."""
-    height = points[:, 1] - level
-    corners: dict[tuple[int, int, float], int] = {}  # (one, other, share of the other)
-    textures: dict[tuple[int, int, float], int] = {}
-    new_faces, new_uv_faces = [], []
-    for face, texture in zip(faces.tolist(), uv_faces.tolist(), strict=True):
-        polygon, outline = [], []
-        for (a, s), (b, t) in zip(
-            zip(face, texture, strict=True),
-            zip(face[1:] + face[:1], texture[1:] + texture[:1], strict=True),
-            strict=True,
-        ):
-            if height[a] >= 0:
-                polygon.append(corners.setdefault((a, a, 0.0), len(corners)))
-                outline.append(textures.setdefault((s, s, 0.0), len(textures)))
-            if (height[a] >= 0) != (height[b] >= 0):
-                # Both triangles of an edge must find the same point: count from the same end.
-                (a, s), (b, t) = sorted(((a, s), (b, t)))
-                share = float(height[a] / (height[a] - height[b]))
-                polygon.append(corners.setdefault((a, b, share), len(corners)))
-                outline.append(textures.setdefault((s, t, share), len(textures)))
-        for k in range(1, len(polygon) - 1):
-            new_faces.append([polygon[0], polygon[k], polygon[k + 1]])
-            new_uv_faces.append([outline[0], outline[k], outline[k + 1]])
-    one, other, share = (np.array(column) for column in zip(*corners, strict=True))
-    first, second, mix = (np.array(column) for column in zip(*textures, strict=True))
-    places = (1 - mix[:, None]) * uvs[first] + mix[:, None] * uvs[second]
-    return _Cut(one, other, share, np.array(new_faces), places, np.array(new_uv_faces))
 
 
 def _five_joints(weights: np.ndarray, bones: list[str]) -> np.ndarray:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
-from uika.canonical.prior import texels_to_vertices
+from uika.canonical.clothes import continued
 from uika.canonical.regions import at_texels
 from uika.canonical.surface import closing_splats
 from uika.head import (
@@ -25,16 +24,16 @@ from uika.head import (
     uv_texels,
     vertex_normals,
 )
+from uika.head.bust import fade
 
-SIZE = 256  # texels along the side of the bust's tile
+SIZE = 256  # texels along the side of the bust's tile where no photo shows it; twice as many elsewhere
 OPACITY = 0.95
-FADE = (0.004, 0.03)  # metres above the cut between which the bust becomes opaque
-GRAZING, FACING = 0.1, 0.5  # cosines between which a photo's colour gains weight
+GRAZING, FACING = 0.03, 0.15  # cosines between which a photo's colour gains weight
+SHOWN = 0.2  # trust from which a texel counts as seen
+MOST_GAIN = 1.6  # between the light of two photos
 SURE_MATTE, FULL_MATTE, EDGE = 0.7, 0.98, 2  # matte between which it does, and pixels inside its edge left out
+OUTLINE = (0.3, 0.7)  # matte between which splats are kept
 BEHIND = 0.006  # metres behind the nearest surface from which a texel counts as hidden
-SOURCE, KIND = 30.0, 0.3  # pull of a seen vertex towards its own colour, of all towards their kind, over an edge's
-LOWER = 0.03  # metres by which collars are higher behind than in front
-KIN = 24  # seen vertices that say what an unseen one is made of
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,8 @@ class BustSplats:
     scales: Tensor  # [M,3] metres
     opacities: Tensor  # [M]
     colors: Tensor  # [M,3] sRGB
-    binding: Binding
+    triangle: Tensor  # [M] int64
+    barycentric: Tensor  # [M,3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,9 @@ class BustView:
 
     vertices: Tensor  # [V,3] metres
     camera: Camera
-    image: Tensor  # [3,S,S] sRGB
+    image: Tensor  # [3,S,S] sRGB, the person on white
     matte: Tensor  # [S,S] in [0,1]
+    inside: Tensor  # [S,S] how far each pixel lies in the photo
 
 
 def bust_splats(
@@ -68,24 +69,66 @@ def bust_splats(
 ) -> BustSplats:
     """Splats for the bust of one person.
 
+    Clothes move and fold between photos: what the first view shows is taken from it alone, and so on.
+
     Args:
         head: a head model with a bust.
         identity: [K] standard deviations.
         offset: [V,3] metres, of the fitted torso.
-        views: N photos.
+        views: N photos, the most telling first.
         neck: texels of the head and their colours [P,3]: unseen skin of the bust goes on from those at its rim.
     """
-    binding = uv_texels(head, SIZE, tile=1)
+    coarse, fine = (uv_texels(head, size, tile=1) for size in (SIZE, 2 * SIZE))
     neutral = HeadParameters.zeros(head).replace(identity=identity)
-    means, quats, scales = closing_splats(head, shaped_vertices(head, neutral, offset), binding)
-    total, weight = torch.zeros(len(binding), 3), torch.zeros(len(binding), 1)
+    vertices = shaped_vertices(head, neutral, offset)
+    observed, known = torch.zeros(len(fine), 3), torch.zeros(len(fine), 1)
     for view in views:
-        color, trust = _seen(head, binding, view)
-        total, weight = total + trust[:, None] * color, weight + trust[:, None]
-    observed, known = total / weight.clamp_min(1e-6), weight.clamp_max(1)
-    colors = torch.lerp(_continued(head, binding, observed, known[:, 0], neck), observed, known)
-    height = surface_points(head.template, head.faces, binding)[:, 1] - head.template[:, 1].min()
-    return BustSplats(means, quats, scales, OPACITY * _ramp(height, *FADE), colors.clamp(0, 1), binding)
+        color, trust = _seen(head, fine, view)
+        if len(views) > 1:
+            color = color * _gain(head, neck, view)
+        share = torch.minimum(trust[:, None], 1 - known)
+        observed, known = observed + share * color, known + share
+    observed = observed / known.clamp_min(1e-6)
+    unseen = continued(head, fine, observed, known[:, 0], neck)
+    shown = torch.nn.functional.max_pool2d(fine.to_map(known), 2)[0] > SHOWN
+    parts = []
+    for binding, step in ((coarse, 1), (fine, 2)):
+        row, column = torch.div(binding.texel, binding.size, rounding_mode="floor"), binding.texel % binding.size
+        kept = shown[row // step, column // step] == (step == 2)
+        means, quats, scales = (value[kept] for value in closing_splats(head, vertices, binding))
+        colors = unseen.colors(head, binding)[kept]
+        if step == 2:
+            colors = torch.lerp(colors, observed[kept], known[kept])
+        height = surface_points(head.template, head.faces, binding)[kept, 1] - head.template[:, 1].min()
+        within = _within(views[0], surface_points(views[0].vertices, head.faces, binding)[kept])
+        parts.append(
+            (
+                means,
+                quats,
+                scales,
+                OPACITY * fade(height) * within,
+                colors.clamp(0, 1),
+                binding.triangle[kept],
+                binding.barycentric[kept],
+            )
+        )
+    return BustSplats(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def _gain(head: HeadModel, neck: tuple[Binding, Tensor], view: BustView) -> Tensor:
+    """Factors [3] that bring a photo under the light that the head's colours are kept under."""
+    color, trust = _seen(head, neck[0], view)
+    one = (trust[:, None] * color * neck[1]).sum(0)
+    return (one / (trust[:, None] * color.square()).sum(0).clamp_min(1e-6)).clamp(1 / MOST_GAIN, MOST_GAIN)
+
+
+def _within(view: BustView, points: Tensor) -> Tensor:
+    """How far points [M,3] lie inside the person's outline [M] in [0,1]; 1 where the photo does not tell."""
+    told = -max_pool2d(-view.inside[None, None], 3, 1, 1)
+    size = view.camera.width
+    grid = (2 * project(points, view.camera)[0] / size - 1)[None, None]
+    share, tells = grid_sample(torch.cat((view.matte[None, None], told), 1), grid, align_corners=False)[0, :, 0]
+    return torch.where(tells > 0.99, _ramp(share, *OUTLINE), 1.0)
 
 
 def _seen(head: HeadModel, binding: Binding, view: BustView) -> tuple[Tensor, Tensor]:
@@ -105,51 +148,10 @@ def _seen(head: HeadModel, binding: Binding, view: BustView) -> tuple[Tensor, Te
     inner = -max_pool2d(-view.matte[None, None], 2 * EDGE + 1, 1, EDGE)[0, 0]
     trust = _ramp(inner[row, column], SURE_MATTE, FULL_MATTE) * _ramp(cosine, GRAZING, FACING) * visible
     grid = (2 * places / size - 1)[None, None]
-    color = grid_sample(view.image[None], grid, padding_mode="border", align_corners=False)[0, :, 0].mT
+    alpha = view.matte.clamp_min(SURE_MATTE / 2)
+    person = ((view.image - (1 - alpha)) / alpha).clamp(0, 1)
+    color = grid_sample(person[None], grid, padding_mode="border", align_corners=False)[0, :, 0].mT
     return color, trust
-
-
-def _continued(
-    head: HeadModel, binding: Binding, observed: Tensor, known: Tensor, neck: tuple[Binding, Tensor]
-) -> Tensor:
-    """Harmonic continuation [M,3] of the seen colours over the bust, which begins with the head's at the rim.
-
-    Each vertex is drawn to the colours seen before or behind it: a shirt that is red in front is red at the back.
-    """
-    from scipy.sparse import coo_matrix, diags
-    from scipy.sparse.linalg import splu
-
-    assert head.bust is not None
-    own, seen = texels_to_vertices(head, binding, observed, known)
-    rim, _ = texels_to_vertices(head, *neck, torch.ones(len(neck[0])))
-    first, count = head.bust.vertex, len(head.template)
-    corners = head.faces[head.bust.face :]
-    row, column = torch.cat((corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]])).numpy().T
-    graph = coo_matrix((np.ones(len(row)), (row, column)), shape=(count, count))
-    graph = (graph + graph.T).tocsr()
-    pull = SOURCE * (2 * seen[first:] - 1).clamp_min(0).double().numpy()[:, None]
-    kind = _kind(head.template[first:], own[first:], seen[first:])
-    draw = 0.0 if kind is None else KIND
-    inner, held = graph[first:, first:], graph[first:, :first]
-    system = diags(np.asarray(graph[first:].sum(1)).ravel() + pull[:, 0] + draw) - inner
-    right = pull * own[first:].double().numpy() + held @ rim[:first].double().numpy()
-    if kind is not None:
-        right = right + draw * kind.double().numpy()
-    solved = torch.from_numpy(splu(system.tocsc()).solve(right)).float()
-    return at_texels(head, binding, torch.cat((rim[:first], solved)))
-
-
-def _kind(points: Tensor, color: Tensor, seen: Tensor) -> Tensor | None:
-    """Colours [B,3] seen where a frontal view, mirrored too, shows the vertices [B,3] a little lower; None if none."""
-    from scipy.spatial import cKDTree
-
-    sure = seen > 0.8
-    if int(sure.sum()) < KIN:
-        return None
-    flat = points[:, :2]
-    places = torch.cat((flat[sure], flat[sure] * torch.tensor([-1.0, 1.0])))
-    near = cKDTree(places.numpy()).query((flat - torch.tensor([0.0, LOWER])).numpy(), KIN)[1]
-    return color[sure].repeat(2, 1)[torch.from_numpy(near)].median(1).values
 
 
 def _ramp(value: Tensor, low: float, high: float) -> Tensor:

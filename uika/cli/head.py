@@ -29,6 +29,8 @@ class ImportHead:
     """FLAME's masks file; without it the regions are found from the geometry."""
     eyelids: tuple[Path, ...] = ()
     """Two .npy files that shut the left and the right lid."""
+    bust: bool = True
+    """Continue the head by neck, shoulders and chest of the built-in one."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("flame.npz")
     """The head file to write; use it with --head or UIKA_HEAD."""
 
@@ -39,7 +41,7 @@ class ImportHead:
         from uika.io.progress import steps
 
         with steps() as say:
-            head = import_flame(self.model, target, self.obj, self.masks, self.eyelids, say)
+            head = import_flame(self.model, target, self.obj, self.masks, self.eyelids, say, bust=self.bust)
         print(f"wrote {target}: {_summary(head)}")
         return 0
 

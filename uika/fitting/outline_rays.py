@@ -15,7 +15,9 @@ def directions(count: int) -> Array:
 
 
 def first_exits(matte: NDArray[np.float32], inside: NDArray[np.float32], centre: Array, rays: Array) -> Array:
-    """Distances [R] in pixels at which rays first leave a matte; NaN where they start outside or leave the photo.
+    """Distances [R] in pixels at which rays first leave a matte; NaN where they start beside it or leave the photo.
+
+    A ray that starts outside the photo counts from where it enters that.
 
     Args:
         matte: [S,S] in [0,1].
@@ -31,10 +33,11 @@ def first_exits(matte: NDArray[np.float32], inside: NDArray[np.float32], centre:
     rows, columns = points[..., 1] - 0.5, points[..., 0] - 0.5
     value = map_coordinates(matte, (rows, columns), order=1, mode="nearest")
     shown = map_coordinates(inside, (rows, columns), order=1, mode="constant") > 0.99
-    out = value < 0.5
-    first = out.argmax(0)
     at = np.arange(len(rays))
-    good = out.any(0) & (first > 0)
+    entry = shown.argmax(0)
+    out = (value < 0.5) & (np.arange(len(steps))[:, None] >= entry)
+    first = out.argmax(0)
+    good = out.any(0) & (first > entry)
     # One step further the photo has to be there still: its own edge is no outline.
     good &= shown[(first + 2).clip(max=len(steps) - 1), at]
     before, after = value[first - 1, at], value[first, at]
@@ -66,3 +69,13 @@ def far_crossings(pixels: Array, edges: NDArray[np.int64], centre: Array, rays: 
     last = distance.argmax(1)
     at = np.arange(len(rays))
     return distance[at, last], last, share[at, last]
+
+
+def same_crossings(pixels: Array, ends: NDArray[np.int64], centre: Array, rays: Array) -> Array:
+    """Distances [R] in pixels at which rays cross the lines of given edges [R,2] of a mesh that has moved a little."""
+    points = pixels[ends] - centre  # [R,2,2]
+    aside = rays[:, :1] * points[..., 1] - rays[:, 1:] * points[..., 0]
+    along = (points * rays[:, None]).sum(-1)
+    width = aside[:, 0] - aside[:, 1]
+    share = aside[:, 0] / np.where(np.abs(width) > 1e-9, width, 1e-9)
+    return along[:, 0] + share * (along[:, 1] - along[:, 0])

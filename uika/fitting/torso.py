@@ -14,20 +14,21 @@ import torch
 from torch import Tensor
 
 from uika.fitting.bust_mesh import BustMesh
-from uika.fitting.outline_rays import Array, directions, far_crossings, first_exits
+from uika.fitting.outline_rays import Array, directions, far_crossings, first_exits, same_crossings
 from uika.head import Camera, HeadModel, HeadParameters, pose_vertices, rest_joints, shaped_vertices
 from uika.head.axis_angle import axis_angle, rotation
 from uika.head.rotations import rodrigues
 
-RAYS = 144
+RAYS = 216
 BELOW_NECK = 0.07  # metres from the joint between torso and neck down to where the rays start
 RIM = 0.02  # metres above the cut that ends the bust in which its outline says nothing
-SPREAD = 0.02  # metres by which clothes and matte are expected to differ from a bare torso
+SPREADS = (0.08, 0.08, 0.05, 0.05, 0.03, 0.03)  # metres, step by step, by which clothes may differ from a bare torso
 TURN_SPREAD = (0.2, 0.35, 0.15)  # radians about x, y and z, around the likely turn
 UPRIGHT = (0.8, 0.5, 0.8)  # share of the turn, about x, y and z, that would make an upright torso face the camera
-STEPS, STEP = 6, 1e-3  # of Gauss-Newton; difference for its derivatives
+INDEPENDENT = 40  # rays that tell as much as all of them
+STEP = 1e-3  # difference for Gauss-Newton's derivatives
 ROUNDS = 5  # of displacement
-MAX_OFFSET, MIN_OFFSET = 0.1, -0.03  # metres of clothes
+MAX_OFFSET, MIN_OFFSET = 0.1, -0.08  # metres of clothes
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,8 @@ class _TorsoFitter:
 
     def run(self) -> TorsoFit:
         turns, shape = np.stack([view.likely for view in self.views]), np.zeros(len(self.mesh.modes))
-        for _ in range(STEPS):
-            turns, shape = self._step(turns, shape)
+        for spread in SPREADS:
+            turns, shape = self._step(turns, shape, spread)
         offset = self.mesh.shaped(self.offset, shape)
         normals = self.mesh.smooth_normals(shaped_vertices(self.head, self.neutral, offset))
         rest, along = self._shaped(shape), normals.double().numpy()
@@ -162,7 +163,7 @@ class _TorsoFitter:
         gap = (view.reach - radius) * depth[ends].mean(1) / view.focal
         return np.where(known, gap, np.nan), edge, share
 
-    def _step(self, turns: Array, shape: Array) -> tuple[Array, Array]:
+    def _step(self, turns: Array, shape: Array, spread: float) -> tuple[Array, Array]:
         """One step of robust Gauss-Newton on turns and shape."""
         count, modes = turns.size, len(shape)
         prior = np.concatenate([1 / np.tile(TURN_SPREAD, len(turns)), np.ones(modes)])
@@ -173,16 +174,22 @@ class _TorsoFitter:
         shifted = [self._shaped(shape + STEP * unit) for unit in np.eye(modes)]
         for view in self.views:
             turn = turns[view.index]
-            gap = self._gaps(view, rest, turn)[0]
-            columns = [self._gaps(view, rest, turn + STEP * unit)[0] for unit in np.eye(3)]
-            columns += [self._gaps(view, moved, turn)[0] for moved in shifted]
-            slope = (np.stack(columns, -1) - gap[:, None]) / STEP
-            good = np.isfinite(gap) & np.isfinite(slope).all(1)
-            if not good.any():
+            gap, edge, _ = self._gaps(view, rest, turn)
+            good = np.flatnonzero(np.isfinite(gap))
+            ends, rays = self.mesh.edges[edge[good]], self.rays[good]
+            pixels, depth = view.project(self._turned(rest, turn))
+            radius = same_crossings(pixels, ends, view.centre, rays)
+            moves = [(rest, turn + STEP * unit) for unit in np.eye(3)] + [(moved, turn) for moved in shifted]
+            columns = [
+                same_crossings(view.project(self._turned(*moved))[0], ends, view.centre, rays) - radius
+                for moved in moves
+            ]
+            slope = -np.stack(columns, -1) / STEP * (depth[ends].mean(1) / view.focal)[:, None]
+            if not len(good):
                 continue
-            residual, jacobian = gap[good] / SPREAD, slope[good] / SPREAD
-            # Neighbouring rays see the same fold of cloth: all together weigh as a dozen independent ones.
-            weight = 12 / RAYS / (1 + residual**2) ** 2
+            residual, jacobian = gap[good] / spread, slope / spread
+            # Neighbouring rays see the same fold of cloth: all together weigh as few independent ones.
+            weight = INDEPENDENT / RAYS / (1 + residual**2) ** 2
             place = np.concatenate([np.arange(3) + 3 * view.index, count + np.arange(modes)])
             matrix[np.ix_(place, place)] += jacobian.T @ (weight[:, None] * jacobian)
             gradient[place] += jacobian.T @ (weight * residual)

@@ -1,7 +1,7 @@
 """The parametric head: its model, parameters, posing, cameras, rasterizer, UV atlas and Gaussian binding."""
 
 from uika.head.atlas import Binding, uv_texels
-from uika.head.binding import pose_gaussians, skin_points, surface_frames, surface_points
+from uika.head.binding import pose_gaussians, skin_points, surface_frames, surface_points, unpose_gaussians
 from uika.head.camera import Camera, ellipse, look_at, orbit, project
 from uika.head.files import load_head, save_arrays, save_head
 from uika.head.model import JOINT_NAMES, JOINT_PARENTS, HeadError, HeadModel
@@ -35,6 +35,7 @@ __all__ = [
     "skin_points",
     "surface_frames",
     "surface_points",
+    "unpose_gaussians",
     "uv_texels",
     "vertex_normals",
 ]

@@ -86,18 +86,47 @@ def pose_gaussians(
         growth, limited to a factor between 0.5 and 2.
     """
     corners = faces.index_select(0, triangle)
-    motion = torch.cat((posed_vertices, _vertex_motion(canonical_vertices, posed_vertices, faces)), -1)
-    moved = _components_first(_interpolate(motion, corners, barycentric))
+    moved, turn, growth = _surface_motion(canonical_vertices, posed_vertices, faces, corners, barycentric)
     lead = (1,) * (moved.ndim - 2)
     offset = _components_first(means - _interpolate(canonical_vertices, corners, barycentric)).view(3, *lead, -1)
-    v, uvw = _components_first(quats).view(4, *lead, -1).split((1, 3))
-    w, xyz = (moved[3:7] * _dot(moved[3:7], moved[3:7]).clamp_min(SMALL).rsqrt()).split((1, 3))
-    twice = 2 * _cross(xyz, offset)
-    posed_means = moved[:3] + offset + w * twice + _cross(xyz, twice)
-    real = w * v - _dot(xyz, uvw)
-    posed_quats = torch.cat((real, w * uvw + v * xyz + _cross(xyz, uvw)))
-    posed_scales = scales * moved[7, ..., None]
+    own = _components_first(quats).view(4, *lead, -1)
+    posed_means, posed_quats = moved + _turned(turn, offset), _product(turn, own)
+    posed_scales = scales * growth[..., None]
     return posed_means.movedim(0, -1).contiguous(), posed_quats.movedim(0, -1).contiguous(), posed_scales
+
+
+def unpose_gaussians(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    canonical_vertices: Tensor,
+    posed_vertices: Tensor,
+    faces: Tensor,
+    triangle: Tensor,
+    barycentric: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The canonical Gaussians that `pose_gaussians` moves to the given ones; arguments as there, one frame.
+
+    Args:
+        means: [M,3] posed centres, metres.
+        quats: [M,4] posed rotations, wxyz.
+        scales: [M,3] posed standard deviations, metres.
+        canonical_vertices: [V,3] the mesh at rest.
+        posed_vertices: [V,3] the mesh that the Gaussians were placed on.
+        faces: [F,3] vertex ids.
+        triangle: [M] triangle of each Gaussian.
+        barycentric: [M,3] its surface point.
+
+    Returns:
+        Canonical means [M,3], quats [M,4] and scales [M,3].
+    """
+    corners = faces.index_select(0, triangle)
+    moved, turn, growth = _surface_motion(canonical_vertices, posed_vertices, faces, corners, barycentric)
+    back = torch.cat((turn[:1], -turn[1:]))
+    rest = _interpolate(canonical_vertices, corners, barycentric)
+    canonical_means = rest + _turned(back, _components_first(means) - moved).mT
+    canonical_quats = _product(back, _components_first(quats)).mT
+    return canonical_means.contiguous(), canonical_quats.contiguous(), scales / growth[:, None]
 
 
 def rigid_turn(canonical_vertices: Tensor, posed_vertices: Tensor) -> Tensor:
@@ -116,6 +145,29 @@ def rigid_turn(canonical_vertices: Tensor, posed_vertices: Tensor) -> Tensor:
     )
     matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
     return torch.linalg.eigh(matrix).eigenvectors[..., -1].to(posed_vertices.dtype)
+
+
+def _surface_motion(
+    canonical: Tensor, posed: Tensor, faces: Tensor, corners: Tensor, barycentric: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Places [3,...,M] of surface points on a posed mesh, their turns [4,...,M] (unit, wxyz) and growth [...,M]."""
+    motion = torch.cat((posed, _vertex_motion(canonical, posed, faces)), -1)
+    moved = _components_first(_interpolate(motion, corners, barycentric))
+    turn = moved[3:7] * _dot(moved[3:7], moved[3:7]).clamp_min(SMALL).rsqrt()
+    return moved[:3], turn, moved[7]
+
+
+def _turned(turn: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors [3,...] turned by unit quaternions [4,...]."""
+    w, xyz = turn.split((1, 3))
+    twice = 2 * _cross(xyz, vectors)
+    return vectors + w * twice + _cross(xyz, twice)
+
+
+def _product(one: Tensor, other: Tensor) -> Tensor:
+    """The Hamilton product [4,...] of quaternions."""
+    (w, xyz), (v, uvw) = one.split((1, 3)), other.split((1, 3))
+    return torch.cat((w * v - _dot(xyz, uvw), w * uvw + v * xyz + _cross(xyz, uvw)))
 
 
 def _interpolate(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor
 
 TORSO = "torso"  # name of the mask of the bust's vertices
+FADE = (0.004, 0.03)  # metres above the cut that ends a bust, between which its picture becomes opaque
+_FLAT = 1e-4  # metres by which the cut's vertices differ in height
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,22 @@ class BustArrays(NamedTuple):
     lbs_weights: Tensor  # [B,5]
     identity: Tensor  # [K,B,3] metres per standard deviation of the head's identity
     modes: Tensor  # [J,B,3]
+
+
+def fade(height: Tensor) -> Tensor:
+    """The share [...] of its opacity that what lies `height` [...] metres above the cut has."""
+    return ((height - FADE[0]) / (FADE[1] - FADE[0])).clamp(0, 1)
+
+
+def cut_rim(template: Tensor) -> Tensor:
+    """Which vertices [V] of a head's template [V,3] lie on the cut that ends its bust."""
+    height = template[:, 1]
+    return height < height.min() + _FLAT
+
+
+def above_cut(template: Tensor, canonical: Tensor, points: Tensor) -> Tensor:
+    """How high [M] in metres points [M,3] lie above the cut of a head's mesh [V,3] with someone's shape."""
+    return points[:, 1] - canonical[cut_rim(template), 1].median()
 
 
 def pack_bust(bust: BustArrays, rank: int) -> dict[str, np.ndarray]:

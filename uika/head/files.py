@@ -91,6 +91,11 @@ def content_hash(arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
+def builtin_head() -> HeadModel:
+    """The built-in head with its bust, whatever `UIKA_HEAD` names."""
+    return _builtin()
+
+
 @lru_cache(maxsize=1)
 def _builtin() -> HeadModel:
     head = _parsed(HEAD, _from_arrays)

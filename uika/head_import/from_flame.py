@@ -11,6 +11,7 @@ from torch import Tensor
 
 from uika.head import HeadError, HeadModel, save_head
 from uika.head.face_paint import eyeballs, paint
+from uika.head_import.bust import with_bust
 from uika.head_import.flame_file import read_flame
 from uika.head_import.landmark_embedding import embed
 from uika.head_import.masks import region_masks
@@ -61,6 +62,8 @@ def import_flame(
     masks: str | Path | None = None,
     eyelids: Sequence[str | Path] = (),
     say: Callable[[str], None] = _silent,
+    *,
+    bust: bool = True,
 ) -> HeadModel:
     """Convert a FLAME model file to a head file for `--head` or `UIKA_HEAD`.
 
@@ -71,6 +74,7 @@ def import_flame(
         masks: FLAME's masks file (a pickle of index lists), used instead of the masks found from the geometry.
         eyelids: two `.npy` files with the displacement of shut lids, left and right.
         say: told what is being done, step by step.
+        bust: whether to continue the head by neck, shoulders and chest, see `uika.head_import.bust`.
 
     Raises:
         HeadError: a file cannot be used; the message names it.
@@ -82,6 +86,9 @@ def import_flame(
     given = {} if masks is None else _read_masks(Path(masks), len(head.template))
     head = adopt(head, say)
     head = replace(head, masks={**head.masks, **given})
+    if bust:
+        say("adding the bust")
+        head = with_bust(head)
     say(f"writing {target}")
     with replacing(target) as temporary:
         save_head(head, temporary)

@@ -16,15 +16,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from uika.avatar import Avatar
-from uika.head import HeadModel
+from uika.head import HeadModel, unpose_gaussians
+from uika.head.bust import above_cut, fade
 from uika.head.rotations import matrices_to_quaternions
 from uika.photo_splats.footprints import footprints
 from uika.photo_splats.layers import SPREAD, Layers, PhotoView, missing, opacities
 from uika.photo_splats.volume import APART, agreed_depth, agreed_volume, carved, half_thickness, unprojected
 
-__all__ = ["LIMIT", "PhotoView", "with_photo_splats"]
+__all__ = ["LIMIT", "PhotoView", "frontal", "with_photo_splats"]
 
-LIMIT = 36_000  # splats by default: with a bust, the file is half as large again as the head's alone
+LIMIT = 60_000  # splats by default
+HEAD_SHARE = 0.6  # of the limit, for head and hair
 RISE = 0.002  # metres by which splats of the outermost hair lie before the surface
 BEHIND = 0.004  # metres by which others lie behind its thin edge
 LEAST_OPACITY = 0.03
@@ -49,38 +51,57 @@ class _Splats:
 
 
 @torch.no_grad()
-def with_photo_splats(avatar: Avatar, head: HeadModel, views: Sequence[PhotoView], limit: int = LIMIT) -> Avatar:
+def with_photo_splats(
+    avatar: Avatar, head: HeadModel, views: Sequence[PhotoView], limit: int = LIMIT, body: PhotoView | None = None
+) -> Avatar:
     """The avatar with splats for what its photos show outside its surface.
 
     Args:
         avatar: the surface as splats.
         head: its head model.
-        views: N photos; the body below the head comes from the most frontal one, since heads turn on it.
+        views: N photos; what they show beside the head is left to `body` or comes from the most frontal one, since
+            heads turn on their bodies.
         limit: number of splats that are added at most.
+        body: a wider crop of the most frontal photo, which shows the shoulders too.
     """
-    facing = [float(-view.camera.viewmat[2, 2]) for view in views]
-    front = max(range(len(views)), key=facing.__getitem__)
+    front = frontal(views)
     several = len(views) > 1
-    layers = [missing(avatar, head, view, clothes=n == front, relit=several) for n, view in enumerate(views)]
+    layers = [
+        missing(avatar, head, view, clothes=body is None and n == front, relit=several) for n, view in enumerate(views)
+    ]
     chosen = [_chosen(head, layers, views, n) for n in range(len(views))]
-    stride = _stride(chosen, round((1 - VOLUME_SHARE) * limit) if several else limit)
     canonical = avatar.canonical_vertices(head)
     carriers = _carriers(head)
+    share = int(HEAD_SHARE * limit)
+    stride = _stride(chosen, round((1 - VOLUME_SHARE) * share) if several else share)
     parts = [
         part
         for n in range(len(views))
         for part in _of_photo(head, canonical, carriers, views, layers, n, chosen[n], stride)
     ]
     if several:
-        parts += _volume(head, canonical, carriers[0], views, layers, round(VOLUME_SHARE * limit))
+        parts += _volume(head, canonical, carriers[0], views, layers, round(VOLUME_SHARE * share))
+    result = _joined(avatar, parts)
+    if body is None:
+        return result
+    lacking = missing(result, head, body, clothes=True, relit=several)
+    worn = lacking.outside & ~lacking.hair
+    stride = _stride([worn], limit - (len(result) - len(avatar)))
+    return _joined(result, _of_photo(head, canonical, carriers, [body], [lacking], 0, worn, stride))
+
+
+def frontal(views: Sequence[PhotoView]) -> int:
+    """The index of the most frontal photo."""
+    facing = [float(-view.camera.viewmat[2, 2]) for view in views]
+    return max(range(len(views)), key=facing.__getitem__)
+
+
+def _joined(avatar: Avatar, parts: Sequence[_Splats]) -> Avatar:
     if not sum(len(part.means) for part in parts):
         return avatar
-
-    def joined(name: str) -> Tensor:
-        return torch.cat([getattr(avatar, name), *(getattr(part, name) for part in parts)])
-
     added: dict[str, Any] = {
-        name: joined(name) for name in ("means", "quats", "scales", "opacities", "colors", "triangle")
+        name: torch.cat([getattr(avatar, name), *(getattr(part, name) for part in parts)])
+        for name in ("means", "quats", "scales", "opacities", "colors", "triangle")
     }
     middle = torch.full((len(added["means"]) - len(avatar), 3), 1 / 3)
     return replace(avatar, **added, barycentric=torch.cat((avatar.barycentric, middle)))
@@ -149,7 +170,10 @@ def _of_photo(
     for far, at, step in ((False, depth, stride), (True, back, 2 * stride)):
         pick = torch.zeros_like(chosen)
         pick[step // 2 :: step, step // 2 :: step] = True
-        pick &= ((own.distance > 0) & own.outside & own.hair & (half > RISE)) if far else chosen
+        if far:
+            pick &= (own.distance > 0) & own.outside & (half > RISE) & (own.hair if head.bust is None else chosen)
+        else:
+            pick &= chosen
         result.append(_made(head, canonical, carriers, view, own, pick, at, step, [m for m, _ in others]))
     return result
 
@@ -229,15 +253,21 @@ def _made(
     triangle = torch.empty(len(points), dtype=torch.int64)
     for at, carrier in ((hair, carriers[0]), (~hair, carriers[1])):
         triangle[at] = _nearest(carrier, middle, points[at])
-    quats, scales = footprints(view, depth, own.outside + 2 * own.rim + 4 * own.hair, row, column, spread)
-    return _Splats(
-        means=canonical[head.faces[triangle]].mean(1) + points - middle[triangle],
-        quats=quats,
-        scales=scales,
-        opacities=opacity[keep],
-        colors=color[:, cell[0], cell[1]].mT[keep],
-        triangle=triangle,
+    means, quats, scales = unpose_gaussians(
+        points,
+        *footprints(view, depth, own.outside + 2 * own.rim + 4 * own.hair, row, column, spread),
+        canonical,
+        own.vertices,
+        head.faces,
+        triangle,
+        torch.full((len(points), 3), 1 / 3),
     )
+    opacity = opacity[keep]
+    if head.bust is not None:
+        opacity = opacity * torch.where(hair, 1.0, fade(above_cut(head.template, canonical, means)))
+    solid = opacity > LEAST_OPACITY
+    colors = color[:, cell[0], cell[1]].mT[keep]
+    return _Splats(*(value[solid] for value in (means, quats, scales, opacity, colors, triangle)))
 
 
 def _body_depth(view: PhotoView, own: Layers) -> Tensor:

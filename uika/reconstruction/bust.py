@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -12,6 +12,7 @@ from uika.avatar import Avatar
 from uika.canonical.bust import BustView, bust_splats
 from uika.head import Binding, Camera, HeadModel, HeadParameters, pose_vertices
 from uika.reconstruction.report import Report
+from uika.reconstruction.sharpening import sharpened
 
 if TYPE_CHECKING:
     from uika.fitting import Fit
@@ -43,23 +44,23 @@ def with_bust(
         found = fit_torso(head, parameters, fits[0].static_offset, cameras, mattes, inside)
         poses = torso_parameters(head, parameters, found.turns)
         vertices = pose_vertices(head, poses, found.offset)
-        views = [BustView(vertices[n], cameras[n], crop.image, crop.matte) for n, crop in enumerate(crops)]
+        order = sorted(range(len(crops)), key=lambda n: float(cameras.viewmat[n, 2, 2]))
+        views = [BustView(vertices[n], cameras[n], crops[n].image, crops[n].matte, crops[n].inside) for n in order]
         neck = Binding(0, avatar.triangle, avatar.triangle, avatar.barycentric), avatar.colors
         bust = bust_splats(head, avatar.identity, found.offset, views, neck)
-
-    result = replace(
-        avatar,
-        head_id=head.id,
-        bust_triangle=None if head.bust is None else head.bust.face,
-        static_offset=found.offset,
-        means=torch.cat((avatar.means, bust.means)),
-        quats=torch.cat((avatar.quats, bust.quats)),
-        scales=torch.cat((avatar.scales, bust.scales)),
-        opacities=torch.cat((avatar.opacities, bust.opacities)),
-        colors=torch.cat((avatar.colors, bust.colors)),
-        triangle=torch.cat((avatar.triangle, bust.binding.triangle)),
-        barycentric=torch.cat((avatar.barycentric, bust.binding.barycentric)),
-    )
+        names = ("means", "quats", "scales", "opacities", "colors", "triangle", "barycentric")
+        joined: dict[str, Any] = {name: torch.cat((getattr(avatar, name), getattr(bust, name))) for name in names}
+        result = replace(
+            avatar,
+            head_id=head.id,
+            bust_triangle=None if head.bust is None else head.bust.face,
+            static_offset=found.offset,
+            **joined,
+        )
+        front = order[0]
+        known = torch.minimum(crops[front].matte, crops[front].inside)
+        lit = poses[front], cameras[front], crops[front].image
+        result = sharpened(result, head, *lit, known, result.on_bust, relit=len(order) > 1)
     return result, poses
 
 

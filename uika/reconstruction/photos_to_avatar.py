@@ -36,7 +36,7 @@ class Reconstruction:
 
     avatar: Avatar
     photos: tuple[Photo, ...]
-    fit: Fit | None  # None for a model that needs none
+    fit: Fit | None  # with the torso's turn in each photo in its parameters; None for a model that needs none
     report: Report
 
 
@@ -93,11 +93,11 @@ def reconstruct(
     observed = fit_files(photos, alone, refine=refine, report=report, loaded=loaded, bust=bust)
     given = observed.fit, observed.images, observed.mattes, observed.digests
     avatar = avatar_from_fit(loaded, alone, *given, report, keep, photo_splats=False)
-    poses = None
     if bust and observed.fit is not None:
         avatar, poses = with_bust(avatar, head, [observed.fit], observed.photos, report)
+        observed = observed._replace(fit=replace(observed.fit, parameters=poses))
     if photo_splats and not loaded.on_template:
-        avatar = with_outside(avatar, head if bust else alone, [observed], report, poses)
+        avatar = with_outside(avatar, head if bust else alone, [observed], report)
     return Reconstruction(with_doubts(avatar, observed.photos), observed.photos, observed.fit, report)
 
 
