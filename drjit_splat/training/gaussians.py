@@ -18,6 +18,8 @@ LAST_RATE = 0.01  # of the means, over the first
 START_OPACITY = {"default": 0.1, "mcmc": 0.5}
 NEIGHBOURS = 3  # whose mean distance a Gaussian starts with as its scale
 RANDOM_REACH = 1.0  # half side of the cube of random starts, over the scene's extent
+CANDIDATES, ROUNDS = 20, 20  # for each random start, at most
+SEEN_SHARE = 0.7  # of the most cameras that see a point; random starts are seen by more
 _CHUNK = 1024
 EPSILON = 1e-15
 
@@ -30,10 +32,8 @@ def start(capture: Capture, config: TrainConfig) -> dict[str, torch.nn.Parameter
         means = capture.points[chosen]
         colors = torch.full_like(means, 0.5) if capture.colors is None else capture.colors[chosen]
     else:
-        count = min(config.random_splats, config.max_splats)
-        cube = 2 * torch.rand(count, 3, generator=generator) - 1
-        means = capture.centre + RANDOM_REACH * capture.extent * cube
-        colors = torch.rand(count, 3, generator=generator)
+        means = _in_view(capture, min(config.random_splats, config.max_splats), generator)
+        colors = torch.rand(len(means), 3, generator=generator)
     count = len(means)
     values = {
         "means": means.clone(),
@@ -44,6 +44,32 @@ def start(capture: Capture, config: TrainConfig) -> dict[str, torch.nn.Parameter
         "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
     }
     return {name: torch.nn.Parameter(value) for name, value in values.items()}
+
+
+def _in_view(capture: Capture, count: int, generator: torch.Generator) -> Tensor:
+    """Random points [count,3] between the cameras that most of these see: the rest of the space is mostly empty."""
+    points, seen = torch.zeros(0, 3), torch.zeros(0)
+    for _ in range(ROUNDS):
+        cube = 2 * torch.rand(max(count * CANDIDATES, 1000), 3, generator=generator) - 1
+        more = capture.centre + RANDOM_REACH * capture.extent * cube
+        points, seen = torch.cat((points, more)), torch.cat((seen, _times_seen(capture, more)))
+        # Where too few are seen that often, the most seen ones fill up.
+        best = (-(seen >= SEEN_SHARE * seen.max()).float()).argsort(stable=True)[:count]
+        if float(seen[best].min()) >= SEEN_SHARE * float(seen.max()):
+            return points[best]
+        kept = seen.argsort(descending=True, stable=True)[:count]
+        points, seen = points[kept], seen[kept]
+    return points
+
+
+def _times_seen(capture: Capture, points: Tensor) -> Tensor:
+    """How many photos [P] show each of the points [P,3]."""
+    seen = torch.zeros(len(points))
+    for photo in capture.photos:
+        x, y, z = (points @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3]).unbind(-1)
+        u, v = photo.K[0, 0] * x / z + photo.K[0, 2], photo.K[1, 1] * y / z + photo.K[1, 2]
+        seen += (z > 0) & (u > 0) & (u < photo.width) & (v > 0) & (v < photo.height)
+    return seen
 
 
 def neighbour_distances(points: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from torch import Tensor
 from ..rasterizer import rasterization
 from ..strategy import DefaultStrategy, MCMCStrategy
 from ..strategy.base import Optimizers, Parameters
-from ..strategy.ops import remove
 from . import checkpoint, corrections, gaussians
 from .captures import Capture, Photo
 from .config import TrainConfig
@@ -177,13 +176,7 @@ class _Run:
         if isinstance(self.strategy, MCMCStrategy):
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, self.step, info, rate)
         else:
-            full = len(self.params["means"]) >= self.config.max_splats
-            self.strategy.grow_grad2d = math.inf if full else DefaultStrategy.grow_grad2d
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, self.step, info)
-            if (count := len(self.params["means"])) > self.config.max_splats:
-                faintest = self.params["opacities"].detach().argsort()[: count - self.config.max_splats]
-                surplus = torch.zeros(count, dtype=torch.bool).index_fill(0, faintest, True)
-                remove(self.params, self.optimizers, self.state, surplus)
 
     def _loss(self, shown: Tensor, wanted: Tensor) -> Tensor:
         weight = self.config.ssim_weight
@@ -253,14 +246,29 @@ class _Run:
         return checkpoint.Checkpoint(self.step, self.seconds, self.config, tensors)
 
 
-class _Together(DefaultStrategy):
-    """The strategy over what all processes have seen."""
+class _Bounded(DefaultStrategy):
+    """The strategy over what all processes have seen, with a largest number of Gaussians.
+
+    Where there is less room than the image asks for, those that it pulls at most get it. To let all of them grow and
+    remove the faintest again would undo a part of the scene at every refinement.
+    """
 
     processes = Processes()
+    max_splats = 0
 
     def _grow(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
         self.processes.add_up([state[name] for name in SUMS], keep=True)
-        return super()._grow(params, optimizers, state, step)
+        pulled = state["grad2d"] / state["count"].clamp_min(1)
+        room = self.max_splats - len(pulled)
+        if room <= 0:
+            return 0, 0
+        usual = self.grow_grad2d
+        if int((pulled > usual).sum()) > room:  # each adds one
+            self.grow_grad2d = float(pulled.topk(room + 1).values[-1])
+        try:
+            return super()._grow(params, optimizers, state, step)
+        finally:
+            self.grow_grad2d = usual
 
 
 def _strategy(config: TrainConfig, processes: Processes) -> DefaultStrategy | MCMCStrategy:
@@ -270,10 +278,10 @@ def _strategy(config: TrainConfig, processes: Processes) -> DefaultStrategy | MC
         stop = max(begin + 1, int(0.8 * config.steps))
         return MCMCStrategy(config.max_splats, refine_start_iter=begin, refine_stop_iter=stop, refine_every=every)
     stop = max(begin + 1, config.steps // 2)
-    strategy = _Together(
+    strategy = _Bounded(
         refine_start_iter=begin, refine_stop_iter=stop, refine_every=every, reset_every=max(3000, config.steps // 5)
     )
-    strategy.processes = processes
+    strategy.processes, strategy.max_splats = processes, config.max_splats
     return strategy
 
 

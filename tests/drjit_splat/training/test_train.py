@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from drjit_splat import cli, load_ply
-from drjit_splat.training import Progress, TrainConfig, open_capture, train
-from drjit_splat.training.loop import read_log
+from drjit_splat.training import Progress, TrainConfig, gaussians, open_capture, train
+from drjit_splat.training.loop import _strategy, read_log
+from drjit_splat.training.processes import Processes
 from tests.drjit_splat.training.made_up import write_colmap, write_nerfstudio
 
 QUICK = TrainConfig(steps=90, random_splats=300, max_splats=400, sh_degree=1, checkpoint_every=30)
@@ -76,3 +77,35 @@ def test_the_command_trains_and_refuses(tmp_path: Path, capsys: pytest.CaptureFi
     assert cli.main(["train", str(tmp_path / "nothing"), "-o", str(run)]) == 2
     assert cli.main([*command, "--steps", "0"]) == 2
     assert "steps must lie between" in capsys.readouterr().err
+
+
+def test_random_starts_lie_where_most_cameras_look(tmp_path: Path) -> None:
+    capture = open_capture(write_nerfstudio(tmp_path))
+    means = gaussians.start(capture, replace(QUICK, random_splats=200))["means"].detach()
+    assert means.shape == (200, 3)
+    seen = torch.zeros(200)
+    for photo in capture.photos:
+        points = means @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3]
+        pixels = points @ photo.K.T
+        seen += ((pixels[:, :2] / pixels[:, 2:] - 24).abs().amax(-1) < 24) & (points[:, 2] > 0)
+    assert float(seen.min()) >= 0.7 * float(seen.max()) - 1e-3 and float(seen.max()) == len(capture.photos)
+
+
+def test_growth_fills_the_room_with_the_most_pulled_and_no_more() -> None:
+    count = 50
+    params = gaussians_at_random(count)
+    optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
+    strategy = _strategy(replace(QUICK, max_splats=60), Processes())
+    pulled = torch.linspace(0, 1, count)
+    state = {"grad2d": pulled.clone(), "count": torch.ones(count), "scene_scale": 1e6}
+    before = params["means"].detach().clone()
+    assert strategy._grow(params, optimizers, state, 100) == (10, 0)  # type: ignore[union-attr]
+    assert torch.equal(params["means"].detach(), torch.cat([before, before[pulled > pulled[39]]]))
+    assert strategy.grow_grad2d == 0.0002  # type: ignore[union-attr]
+    assert strategy._grow(params, optimizers, state, 100) == (0, 0)  # type: ignore[union-attr]
+
+
+def gaussians_at_random(count: int) -> dict[str, torch.nn.Parameter]:
+    generator = torch.Generator().manual_seed(0)
+    sizes = {"means": (count, 3), "scales": (count, 3), "quats": (count, 4), "opacities": (count,)}
+    return {name: torch.nn.Parameter(torch.randn(size, generator=generator)) for name, size in sizes.items()}
