@@ -23,6 +23,7 @@ MAGIC = b"NGSP"
 VERSION = 3  # that is written
 MAX_SPLATS = 10_000_000  # of one file, as the format's own program allows
 FRACTION_BITS = 12
+_MOST_PACKED = 200  # bytes of splats in one of the file; compressors reach a thousand with nothing but zeros
 _MOST_BITS = 23  # of a position's 24, one is its sign
 _COLOR_SCALE = 0.15  # of the constant harmonic
 _SH_BUCKETS = (8, 16)  # steps of harmonics of the first degree and of the others
@@ -138,11 +139,16 @@ def _sizes(version: int, count: int, degree: int) -> list[int]:
     return [count * each for each in (9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
 
 
-def _checked(path: Path, version: int, count: int, degree: int, bits: int) -> None:
+def _checked(path: Path, size: int, version: int, count: int, degree: int, bits: int) -> None:
     if degree > 3 or count > MAX_SPLATS or bits > _MOST_BITS:
         raise ValueError(
             f"{path} says {count:,} splats with harmonics of degree {degree} and {bits} bits; "
             f"at most {MAX_SPLATS:,}, degree 3 and {_MOST_BITS} can be read"
+        )
+    unpacked = sum(_sizes(version, count, degree))
+    if unpacked > max(_MOST_PACKED * size, 1 << 26):
+        raise ValueError(
+            f"{path} says {count:,} splats, {unpacked:,} bytes in {size:,}: more than splats can be packed"
         )
 
 
@@ -155,7 +161,7 @@ def _legacy(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
         version, count, degree, bits, _, _ = struct.unpack("<IIBBBB", found[4:16])
         if version not in (2, 3):
             raise ValueError(f"{path} is of version {version}; 2, 3 and 4 can be read")
-        _checked(path, version, count, degree, bits)
+        _checked(path, len(data), version, count, degree, bits)
         needed = 16 + sum(_sizes(version, count, degree))
         # No more is unpacked than the header says, whatever the file would become.
         while len(found) < needed and not unpacker.eof:
@@ -180,7 +186,7 @@ def _current(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
     version, count, degree, bits, _, streams, table = struct.unpack_from("<IIBBBBI", data, 4)
     if version != 4:
         raise ValueError(f"{path} is of version {version}; 2, 3 and 4 can be read")
-    _checked(path, version, count, degree, bits)
+    _checked(path, len(data), version, count, degree, bits)
     sizes = _sizes(version, count, degree)
     wanted = [size for size in sizes if size] if streams < len(sizes) else sizes
     if streams != len(wanted) or table + 16 * streams > len(data):

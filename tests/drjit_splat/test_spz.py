@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import zlib
 from pathlib import Path
 
 import pytest
@@ -93,7 +94,7 @@ def test_version_2_keeps_three_components(tmp_path: Path) -> None:
         (b"ply\n", "is no .spz file"),
         (gzip.compress(b"NGSX" + bytes(40)), "is no .spz file"),
         (gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0)), "version 9"),
-        (gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 3, 5_000_000, 3, 12, 0, 0) + bytes(99)), "cut short"),
+        (gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 3, 900_000, 3, 12, 0, 0) + bytes(99)), "cut short"),
         (gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 3, 2**31, 3, 12, 0, 0)), "at most"),
         (gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 3, 1, 7, 12, 0, 0)), "degree 7"),
         (gzip.compress(b"NGSP" + bytes(60))[:-20], "version 0|damaged|cut short"),
@@ -107,6 +108,22 @@ def test_damaged_files_are_named(tmp_path: Path, content: bytes, message: str) -
     with pytest.raises(ValueError, match=message) as refused:
         load_spz(path)
     assert "bad.spz" in str(refused.value)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, version: int) -> None:
+    count = 10_000_000
+    if version == 3:
+        packer = zlib.compressobj(9, wbits=31)
+        data = (
+            packer.compress(b"NGSP" + struct.pack("<IIBBBB", 3, count, 3, 12, 0, 0) + bytes(1 << 16)) + packer.flush()
+        )
+    else:
+        table = b"".join(struct.pack("<QQ", 20, count * each) for each in (9, 1, 3, 3, 4, 45))
+        data = b"NGSP" + struct.pack("<IIBBBBI", 4, count, 3, 12, 0, 6, 32) + bytes(12) + table + bytes(120)
+    (tmp_path / "bomb.spz").write_bytes(data)
+    with pytest.raises(ValueError, match=r"bomb\.spz says 10,000,000 splats, 650,000,000 bytes in"):
+        load_spz(tmp_path / "bomb.spz")
 
 
 def test_every_cut_and_every_flipped_byte_ends_in_a_sentence_or_splats(tmp_path: Path) -> None:

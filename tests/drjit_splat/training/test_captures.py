@@ -120,6 +120,11 @@ def damaged(tmp_path: Path, kind: str) -> Path:
         return write_colmap(tmp_path, binary=True, model=4)
     folder = write_colmap(tmp_path, binary=True)
     table = folder / "sparse" / "0" / "images.bin"
+    if kind == "no cameras":
+        (folder / "sparse" / "0" / "cameras.bin").write_bytes(b"\0" * 8)
+    if kind == "unknown model":
+        cameras = folder / "sparse" / "0" / "cameras.bin"
+        cameras.write_bytes(cameras.read_bytes()[:12] + b"\x63" + cameras.read_bytes()[13:])
     if kind == "cut short":
         table.write_bytes(table.read_bytes()[:-30])
     if kind == "lying count":
@@ -147,6 +152,8 @@ def damaged(tmp_path: Path, kind: str) -> Path:
         ("no frames", "no photos"),
         ("not JSON", r"transforms\.json: cannot be read as JSON"),
         ("camera model", "OPENCV bends rays"),
+        ("no cameras", r"images\.bin: image '000\.png' has the camera 7, which .*cameras\.bin lacks"),
+        ("unknown model", r"cameras\.bin: is no COLMAP table.*unknown camera model 99"),
         ("cut short", r"images\.bin: is no COLMAP table or is cut short"),
         ("lying count", r"images\.bin.*more than it holds"),
         ("no images", r"images\.bin: holds no image"),

@@ -74,7 +74,8 @@ def test_the_command_trains_and_refuses(tmp_path: Path, capsys: pytest.CaptureFi
     (run / "checkpoint.safetensors").write_bytes(b"no checkpoint")
     assert cli.main(command) == 2
     assert "remove it to begin anew" in capsys.readouterr().err
-    assert cli.main(["train", str(tmp_path / "nothing"), "-o", str(run)]) == 2
+    assert cli.main(["train", str(tmp_path / "nothing"), "-o", str(tmp_path / "other")]) == 2
+    assert "nothing: no such data set" in capsys.readouterr().err and not (tmp_path / "other").exists()
     assert cli.main([*command, "--steps", "0"]) == 2
     assert "steps must lie between" in capsys.readouterr().err
 
