@@ -43,9 +43,10 @@ def judge(photo: NDArray[np.uint8], landmarks: NDArray[np.float64]) -> Trust:
         return Trust(f"the face in it is not upright; turn the photo by {degrees} degrees counterclockwise", True)
     lenience = 1.0 if scores[0] >= PERSON else LENIENCE
     if scores[0] < SURE and not _agree(photo, square, crop, lenience):
+        animal = "" if scores[0] >= PERSON else " or hardly a person's"
         return Trust(
-            "the face in it is too blurred, noisy, covered or cut off for its landmarks to be found; use a clear "
-            "photo of the whole face",
+            f"the face in it is too blurred, noisy, covered or cut off{animal} for its landmarks to be found; use a "
+            "clear photo of the whole face",
             True,
         )
     return Trust("", scores[0] >= PERSON)
