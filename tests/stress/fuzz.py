@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import json
 import multiprocessing
 import random
@@ -28,6 +29,7 @@ from .targets import TARGETS
 
 MEMORY = 1 << 30  # bytes that reading a damaged file may take at once
 SECONDS = 10  # of processor time, so that a busy machine makes no findings
+COLLECTED = 40  # files after which memory is tidied up: threads of PyAV's decoders live until then
 PATIENCE = 120  # of the clock, for readers that sleep
 
 
@@ -82,6 +84,8 @@ def _child(name: str, count: int, seed: int, folder: Path, kept: Path, pipe: Any
     signal.signal(signal.SIGPROF, _stop)
     result, before, seen = Result(name), _resident(), Counter[str]()
     for index in range(count):
+        if index % COLLECTED == 0:
+            gc.collect()
         suffix, data = rng.choice(good)
         damaged = target.mutate(data, rng)
         path = folder / "work" / f"damaged{suffix}"
