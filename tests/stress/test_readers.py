@@ -22,6 +22,7 @@ from uika.head import HeadError
 from uika.head_import import from_flame
 from uika.head_import.flame_file import read_flame
 from uika.io.radiance_hdr import read_hdr
+from uika.io.sound import read_sound
 from uika.io.video import write_video
 from uika.model import CheckpointError, load_checkpoint
 from uika.motion import MotionError, read_bvh
@@ -201,3 +202,14 @@ def test_light_that_promises_more_than_it_holds(size: tuple[int, int], tmp_path:
     (tmp_path / "a.hdr").write_bytes(head + bytes([2, 2, size[1] >> 8, size[1] & 255]) * 20)
     with pytest.raises(UikaError, match=r"a\.hdr: "):
         read_hdr(tmp_path / "a.hdr")
+
+
+@pytest.mark.parametrize("rate", [1, 3])
+def test_sound_of_a_few_samples_a_second(rate: int, tmp_path: Path) -> None:
+    data = bytes(8000)
+    head = struct.pack("<4sIHHIIHH", b"fmt ", 16, 1, 1, rate, 2 * rate, 2, 16)
+    (tmp_path / "a.wav").write_bytes(
+        b"RIFF" + struct.pack("<I", 8036) + b"WAVE" + head + b"data" + b"\x40\x1f\0\0" + data
+    )
+    with pytest.raises(UikaError, match=r"a\.wav: is longer than 10 minutes"):
+        read_sound(tmp_path / "a.wav")

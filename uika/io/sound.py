@@ -46,7 +46,7 @@ def read_sound(path: str | Path) -> Sound:
         raise UikaError(f"{source}: no such sound file")
     _check_whole(source)
     parts: list[NDArray[np.float32]] = []
-    count = 0
+    seconds = 0.0
     try:
         with open_media(source) as container:
             if not container.streams.audio:
@@ -55,11 +55,10 @@ def read_sound(path: str | Path) -> Sound:
                 raise _too_long(source)
             resampler = av.AudioResampler(format="fltp", layout="mono", rate=RATE)
             for frame in container.decode(audio=0):
-                for part in resampler.resample(frame):
-                    parts.append(part.to_ndarray()[0])
-                    count += len(parts[-1])
-                if count > MAX_SECONDS * RATE:
+                seconds += frame.samples / max(frame.sample_rate, 1)
+                if seconds > MAX_SECONDS:  # known before a frame of one sample a second is blown up
                     raise _too_long(source)
+                parts += [part.to_ndarray()[0] for part in resampler.resample(frame)]
             parts += [part.to_ndarray()[0] for part in resampler.resample(None)]
     except UikaError:
         raise
