@@ -43,6 +43,7 @@ SCRIPTS: Mapping[str, Sequence[str]] = {
     "mitsuba_spp": ("--size", "64", "--reference", "64", "--renders", "20"),
     "synthesis_quality": ("--sheet", "2", "--people", "1", "--size", "64"),
     "scene_validation": ("--poses", "1", "--views", "1"),
+    "bust_validation": ("--poses", "1", "--views", "1"),
     "synthesis_speed": ("--sizes", "64", "--identities", "1", "--frames", "1"),
     "synthesis_scale": ("--size", "64", "--moments", "2", "--opened", "50"),
     "watermark": ("--pictures", "2", "--unmarked", "6"),

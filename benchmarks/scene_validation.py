@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--report", type=Path, help="folder for the page with the pictures")
     arguments = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
-        heads = {"built-in head": load_head().without_bust, "FLAME-format head": flame_head(Path(folder))}
+        heads = {"built-in head": load_head().without_bust, "FLAME-format head": flame_head(Path(folder)).without_bust}
         found = {title: validate(head, arguments.poses, VIEWS[: arguments.views]) for title, head in heads.items()}
     if arguments.report:
         write_report(arguments.report, list(found.values()))

@@ -1,13 +1,14 @@
 """Small avatars for tests and benchmarks: the surface of a head with colours."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from uika import Avatar, HeadModel
-from uika.canonical.surface import SurfaceTexels, surface_texels
-from uika.head import Binding
+from uika.canonical.surface import SurfaceTexels, closing_splats, surface_texels
+from uika.head import Binding, uv_texels
 
 
 def surface_avatar(
@@ -45,3 +46,22 @@ def painted_avatar(head: HeadModel, size: int = 64) -> Avatar:
         return left * torch.tensor([0.9, 0.1, 0.1]) + (1 - left) * torch.tensor([0.1, 0.1, 0.9])
 
     return surface_avatar(head, size, halves, photos="none", note="ünïcode")
+
+
+def painted_bust(head: HeadModel, size: int = 64) -> Avatar:
+    """The painted head on a grey bust."""
+    avatar = painted_avatar(head, size)
+    assert head.bust is not None
+    binding = uv_texels(head, 3 * size // 4, tile=1)
+    means, quats, scales = closing_splats(head, head.template, binding)
+    return replace(
+        avatar,
+        bust_triangle=head.bust.face,
+        means=torch.cat((avatar.means, means)),
+        quats=torch.cat((avatar.quats, quats)),
+        scales=torch.cat((avatar.scales, scales)),
+        opacities=torch.cat((avatar.opacities, torch.full((len(binding),), 0.9))),
+        colors=torch.cat((avatar.colors, torch.full((len(binding), 3), 0.3))),
+        triangle=torch.cat((avatar.triangle, binding.triangle)),
+        barycentric=torch.cat((avatar.barycentric, binding.barycentric)),
+    )

@@ -1,13 +1,10 @@
 """What a portrait's camera shows, with and without the shoulders."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from tests.avatars import painted_avatar
+from tests.avatars import painted_avatar, painted_bust
 from uika import Avatar, HeadModel, load_head, neutral_camera
-from uika.canonical.surface import closing_splats
 from uika.head import project, uv_texels
 
 
@@ -16,26 +13,8 @@ def head() -> HeadModel:
     return load_head()
 
 
-def with_bust(head: HeadModel) -> Avatar:
-    avatar = painted_avatar(head, 64)
-    assert head.bust is not None
-    binding = uv_texels(head, 48, tile=1)
-    means, quats, scales = closing_splats(head, head.template, binding)
-    return replace(
-        avatar,
-        bust_triangle=head.bust.face,
-        means=torch.cat((avatar.means, means)),
-        quats=torch.cat((avatar.quats, quats)),
-        scales=torch.cat((avatar.scales, scales)),
-        opacities=torch.cat((avatar.opacities, torch.full((len(binding),), 0.9))),
-        colors=torch.cat((avatar.colors, torch.full((len(binding), 3), 0.3))),
-        triangle=torch.cat((avatar.triangle, binding.triangle)),
-        barycentric=torch.cat((avatar.barycentric, binding.barycentric)),
-    )
-
-
 def test_the_head_is_framed_as_without_bust(head: HeadModel) -> None:
-    plain, whole = painted_avatar(head, 64), with_bust(head)
+    plain, whole = painted_avatar(head, 64), painted_bust(head)
     expected, found = neutral_camera(plain, 20.0), neutral_camera(whole, 20.0, frame="head")
     assert torch.equal(expected.viewmat, found.viewmat)
     assert torch.equal(neutral_camera(plain, 20.0, frame="head").viewmat, expected.viewmat)
@@ -43,7 +22,7 @@ def test_the_head_is_framed_as_without_bust(head: HeadModel) -> None:
 
 @pytest.mark.parametrize("yaw", [0.0, 50.0, 180.0])
 def test_a_portrait_shows_the_shoulders_and_ends_in_the_bust(head: HeadModel, yaw: float) -> None:
-    avatar = with_bust(head)
+    avatar = painted_bust(head)
     camera = neutral_camera(avatar, yaw, size=200)
     pixels, _ = project(avatar.means, camera)
     assert float(pixels[:, 0].min()) > 0 and float(pixels[:, 0].max()) < 200
@@ -53,7 +32,7 @@ def test_a_portrait_shows_the_shoulders_and_ends_in_the_bust(head: HeadModel, ya
 
 
 def test_the_file_tells_the_bust(head: HeadModel, tmp_path) -> None:
-    avatar = with_bust(head)
+    avatar = painted_bust(head)
     avatar.save(tmp_path / "a.safetensors")
     read = Avatar.load(tmp_path / "a.safetensors")
     assert read.bust_triangle == avatar.bust_triangle

@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from tests.avatars import painted_avatar
+from tests.avatars import painted_avatar, painted_bust
 from uika import Avatar, HeadModel, load_head
 from uika.avatar.framing import neutral_camera
 from uika.avatar.rendering import render
-from uika.head import HeadParameters, project, rasterize
+from uika.fitting.torso import torso_parameters
+from uika.head import HeadParameters, look_at, project, rasterize
+from uika.head.bust import above_cut
 from uika.photo_splats import PhotoView, with_photo_splats
 
 SIZE = 256
@@ -168,3 +170,32 @@ def grown(avatar: Avatar, head: HeadModel, points: Tensor) -> Avatar:
         triangle=torch.cat((avatar.triangle, torch.full((count,), scalp))),
         barycentric=torch.cat((avatar.barycentric, torch.full((count, 3), 1 / 3))),
     )
+
+
+def test_a_wider_crop_adds_clothes_to_the_turned_torso() -> None:
+    whole = load_head()
+    assert whole.bust is not None
+    avatar = painted_bust(whole, 96)
+    pose = torso_parameters(whole, HeadParameters.zeros(whole), torch.tensor([0.0, 0.5, 0.1]))
+    camera = look_at(0.0, 0.0, 1.6, target=(0.0, -0.1, 0.0), fov_y=26.0, size=SIZE)
+    near = look_at(0.0, 0.0, 1.6, target=(0.0, 0.0, 0.0), fov_y=13.0, size=SIZE)
+    shown = render(avatar, pose, camera, whole)
+    row = int((shown.alpha[:, 60] > 0.5).nonzero()[0])
+    matte = torch.maximum(shown.alpha, disc(60, row, 14))
+    share = (shown.alpha / matte.clamp_min(1e-6))[..., None]
+    image = share * shown.rgb + (1 - share) * GREEN
+    image = matte[..., None] * image + 1 - matte[..., None]
+    body = PhotoView(pose, camera, image.permute(2, 0, 1), matte, torch.zeros(SIZE, SIZE))
+    close = render(avatar, pose, near, whole)
+    view = PhotoView(pose, near, close.rgb.permute(2, 0, 1), close.alpha, close.alpha)
+    result = with_photo_splats(avatar, whole, [view], body=body)
+    assert len(result) - len(avatar) > 100
+    green = (result.colors[len(avatar) :] - GREEN).norm(dim=-1) < 0.1
+    assert int(green.sum()) > 100
+    assert bool((result.triangle[len(avatar) :][green] >= whole.bust.face).all())
+    again = render(result, pose, camera, whole)
+    beyond = (disc(60, row, 12) > 0) & (shown.alpha < 0.05)
+    assert int(beyond.sum()) > 50
+    assert again.alpha[beyond].mean() > 0.9
+    assert (again.rgb[beyond] - GREEN).abs().mean() < 0.08
+    assert above_cut(whole.template, avatar.canonical_vertices(whole), result.means).min() > -1e-3

@@ -15,6 +15,7 @@ from uika.head import Binding, HeadModel
 
 SOURCE = 30.0  # pull of a seen vertex towards its own colour over that of an edge towards a neighbour's
 FAINT = 1e-6  # of what nothing reaches
+SEEN = 0.3  # share of what lies around a vertex, doubled, from which it is
 SHADE = (0.7, 1.2)  # brightness of a neck's skin over that of the neck's rim
 LIKE_SKIN, UNLIKE_SKIN = 0.07, 0.13  # sRGB distance from skin so shaded up to which, and from which, it is none
 EDGE = (0.66, 0.74)  # share of skin between which clothes end
@@ -49,21 +50,35 @@ def continued(
     """
     assert head.bust is not None
     first = head.bust.vertex
-    own, seen = texels_to_vertices(head, binding, observed, known)
-    head_colors, _ = texels_to_vertices(head, *neck, torch.ones(len(neck[0])))
-    own, sure = own[first:], (2 * seen[first:] - 1).clamp_min(0)
+    head_colors, told = texels_to_vertices(head, *neck, torch.ones(len(neck[0])))
     touched = head.faces[head.bust.face :].unique()
     rim = touched[touched < first]
-    likeness = _skinlike(own, head_colors[rim].median(0).values)
+    typical = head_colors[rim[told[rim] > 0]].median(0).values
+    head_colors = torch.where(told[:, None] > 0, head_colors, typical)[:first]
+    # Told apart before they are averaged: a vertex at a collar's edge has both.
+    likeness = _skinlike(observed, typical)
+
+    def at_vertices(share: Tensor) -> tuple[Tensor, Tensor]:
+        color, seen = texels_to_vertices(head, binding, observed, known * share)
+        return color[first:], seen[first:]
+
+    (skin, on_skin), (cloth, on_cloth) = at_vertices(likeness), at_vertices(1 - likeness)
     graph = _Graph(head)
-    bare = graph.continued(likeness[:, None], sure, torch.ones(first, 1))
-    skin = graph.continued(own, sure * likeness, head_colors[:first])
-    cloth = graph.continued(own, sure * (1 - likeness), None)
-    if not bool((sure * (1 - likeness) > 0).any()):
+    both = on_skin + on_cloth
+    bare = graph.continued((on_skin / both.clamp_min(1e-6))[:, None], (2 * both - 1).clamp_min(0), torch.ones(first, 1))
+    skin = graph.continued(skin, _sure(on_skin), head_colors)
+    if bool((_sure(on_cloth) > 0).any()):
+        cloth = graph.continued(cloth, _sure(on_cloth), None)
+    else:
         cloth, bare = skin, torch.ones_like(bare)
     parts = torch.cat((skin, cloth, bare), 1)
-    whole = torch.cat((torch.cat((head_colors[:first], head_colors[:first], torch.ones(first, 1)), 1), parts))
+    whole = torch.cat((torch.cat((head_colors, head_colors, torch.ones(first, 1)), 1), parts))
     return Continued(whole[:, :3], whole[:, 3:6], whole[:, 6])
+
+
+def _sure(seen: Tensor) -> Tensor:
+    """How far a vertex of which a share was seen is trusted."""
+    return (2 * seen - SEEN).clamp(0, 1)
 
 
 def _skinlike(color: Tensor, skin: Tensor) -> Tensor:
