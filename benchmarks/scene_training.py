@@ -7,8 +7,11 @@ Textured meshes are rendered from 48 cameras on two circles, every eighth of whi
 from __future__ import annotations
 
 import argparse
+import cProfile
 import json
+import pstats
 import resource
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ import numpy as np
 
 from benchmarks.figures import lines
 from benchmarks.harness import save
-from drjit_splat.training import Progress, TrainConfig, open_capture, train
+from drjit_splat.training import Progress, TrainConfig, checkpoint, loop, open_capture, train
 from scenes import load_mitsuba, write_png
 
 CAMERAS, DISTANCE, HEIGHTS, FOV = 48, 4.2, (0.6, 1.9), 40.0  # metres, degrees
@@ -77,6 +80,34 @@ def photograph(folder: Path, size: int, spp: int) -> Path:
     return folder
 
 
+PARTS = {  # what a step spends its time on, and the function that all of it lies in
+    "rendering": "rasterization",
+    "SSIM": "ssim",
+    "gradients": "backward",
+    "optimizers": "step",
+    "strategy": "step_post_backward",
+}
+
+
+def where_time_goes(capture: Any, folder: Path, config: TrainConfig, steps: int = 40) -> dict[str, float]:
+    """Milliseconds of a step by part, measured on the run's last state."""
+    run = loop._Run(capture, config, checkpoint.load(folder), loop.Processes())
+    for _ in range(5):
+        run.advance(0.0)
+    profiler = cProfile.Profile()
+    begun = time.perf_counter()
+    profiler.runcall(lambda: [run.advance(0.0) for _ in range(steps)])
+    whole = 1000 * (time.perf_counter() - begun) / steps
+    found = dict.fromkeys(PARTS, 0.0)
+    for (file, _, name), (*_, seconds, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
+        for part, function in PARTS.items():
+            place = {"gradients": "torch/_tensor.py", "optimizers": "optim/adam.py"}.get(part, "drjit_splat")
+            if name == function and place in file:
+                found[part] += 1000 * seconds / steps
+    found["rest"] = whole - sum(found.values())
+    return found
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=256)
@@ -98,6 +129,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         curves[strategy] = [(part[-1].seconds / 60, sum(p.psnr for p in part) / len(part)) for part in means]
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         rows.append({"strategy": strategy, **{k: v for k, v in figures.items() if k != "held_out"}, "peak_mb": peak})
+        rows[-1]["ms"] = where_time_goes(capture, arguments.folder / strategy, config)
         print(json.dumps(rows[-1]), flush=True)
     table = ["| strategy | splats | steps | minutes | held-out PSNR | held-out SSIM | peak MB |", "|" + "---|" * 7]
     table += [
@@ -105,6 +137,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"| {r['ssim']:.4f} | {r['peak_mb']:.0f} |"
         for r in rows
     ]
+    parts = list(rows[0]["ms"])
+    table += ["", "Milliseconds of a step at the end of the run, by part (under a profiler):", ""]
+    table += ["| strategy | " + " | ".join(parts) + " |", "|" + "---|" * (len(parts) + 1)]
+    table += [f"| {r['strategy']} | " + " | ".join(f"{r['ms'][part]:.1f}" for part in parts) + " |" for r in rows]
     about = f"{len(capture.photos)} pictures of {arguments.size}^2 pixels, {len(capture.held_out)} held out."
     save("scene_training", "Splats trained from a Mitsuba scene", about + "\n\n" + "\n".join(table), {"rows": rows})
     lines("scene_training", {("minutes", "training PSNR, dB"): curves}, log="")
