@@ -15,6 +15,7 @@ from uika.head import HeadModel, load_head
 from uika.head.actions import ARKIT_ACTIONS
 from uika.motion import MotionError, read_csv, read_json, read_motion
 from uika.motion.action_names import find_action
+from uika.motion.frame_times import rate_of
 
 JAW = ARKIT_ACTIONS.index("jawOpen")
 AMOUNTS = [round(0.01 * k, 2) for k in range(52)]
@@ -277,3 +278,22 @@ def test_warnings_are_one_line_of_the_program(tmp_path: Path, capsys: pytest.Cap
         f"uika: warning: {path}: no face in 1 of 3 frames, the first at frame 1; filled in from their neighbours"
     ]
     assert (warnings.filters, warnings.showwarning) == (before, shown)
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        [k for k in range(36) if k % 3 != 1],  # every third lost: more long steps than short ones
+        [k for k in range(36) if not 11 < k < 21],
+        [*range(18), *range(18, 36, 2)],
+    ],
+)
+@pytest.mark.parametrize("rate", [25, 30, 60])
+def test_the_rate_is_that_at_which_frames_were_lost(kept: list[int], rate: int) -> None:
+    # Whole milliseconds over half a second cannot tell 60 from 59.94.
+    assert rate_of(np.round(np.array(kept) / rate, 3)) == pytest.approx(rate, rel=2e-3)
+
+
+def test_steps_that_are_no_multiples_have_their_usual_rate() -> None:
+    steps = np.random.default_rng(0).uniform(0.028, 0.045, 200)
+    assert rate_of(np.cumsum(steps)) == pytest.approx(1 / np.median(steps), rel=0.01)

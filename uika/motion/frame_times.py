@@ -10,6 +10,8 @@ MAX_FRAMES = 100_000
 _LOWEST, _HIGHEST = 0.5, 240.0  # frames per second
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
 _NEAR = 3e-3  # rates this close to a common one are that one
+_SHORT, _NOT_RARE = 0.1, 0.25  # place of a short step among all, and the least share of steps as short
+_ROUNDING = 0.1  # of a step, between steps and multiples of the shortest
 _NTSC = 1000 / 1001
 
 Times = NDArray[np.float64]
@@ -30,11 +32,22 @@ def in_seconds(times: Times) -> Times:
 
 
 def rate_of(seconds: Times) -> float:
-    """Frames per second that rising times [T] mean; of uneven ones the rate between most neighbours."""
+    """Frames per second that rising times [T] mean.
+
+    Of uneven ones the rate at which frames were lost, if all steps are multiples of one that is not rare, else the rate
+    between most neighbours.
+    """
     steps = np.diff(seconds)
     mean = float(seconds[-1] - seconds[0]) / len(steps)
     if not is_even(seconds, 1 / mean):
-        mean = float(np.median(steps[steps > 0]))
+        steps = steps[steps > 0]
+        short = steps[steps < 1.5 * np.quantile(steps, _SHORT)].mean()
+        multiples = steps / short
+        whole = multiples.round()
+        if (np.abs(multiples - whole) < _ROUNDING).all() and (whole == 1).mean() >= _NOT_RARE:
+            mean = float(steps.sum() / whole.sum())
+        else:
+            mean = float(np.median(steps))
     return _common(1 / mean)
 
 
