@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
 from uika.errors import UikaError
 from uika.io.files import check_folder
+
+if TYPE_CHECKING:
+    from uika.data.datasets import People
+    from uika.train import TrainConfig
 
 OVERFIT_GOAL = 35.0  # dB
 _OF_CORRESPONDENCE = ("output", "part", "steps", "resume", "seed", "people", "learning_rate", "save_every")
@@ -56,6 +60,10 @@ class Train:
     """Steps from one checkpoint to the next."""
     init: Path | None = None
     """A model of the same kind to start from."""
+    items: Path | None = None
+    """Folder that keeps prepared items."""
+    prepare: str = ""
+    """I/N: only fill that folder with the items of every Nth person."""
     lpips: Path | None = None
     """LPIPS weights, else gradients."""
     backbone: Annotated[Path | None, arg(metavar="PATH")] = None
@@ -106,6 +114,8 @@ class Train:
             if self.part == "estimator":
                 raise UikaError("--estimator helps to train the reconstructor; --init starts an estimator from another")
             check_kind(self.estimator, ESTIMATORS)
+        if self.prepare:
+            return self._prepare(config, people)
         group = join_group(self.device)
         try:
             setup = Setup(
@@ -118,6 +128,7 @@ class Train:
                 init=self.init,
                 backbone=self.backbone,
                 estimator=self.estimator,
+                items=self.items,
             )
             train(config, people, setup, group)
         finally:
@@ -152,4 +163,15 @@ class Train:
         with tqdm(total=self.people, desc="people", unit="person") as bar:
             make_items(items, head, range(self.people), ItemSettings(), lambda _: bar.update())
         print(f"wrote {train_surface(self.output, items, head, config, self.resume)}")
+        return 0
+
+    def _prepare(self, config: TrainConfig, people: People) -> int:
+        if self.items is None:
+            raise UikaError("--prepare needs the folder to fill: --items DIR")
+        from uika.data.synthesis import shard_part
+        from uika.train import PreparedItems
+
+        part, parts = shard_part(self.prepare, "--prepare")
+        made = PreparedItems(self.items, people, config).prepare(part, parts)
+        print(f"prepared {made:,} items of {len(people):,} people in {self.items}")
         return 0

@@ -53,10 +53,7 @@ class Synthesis:
         Raises:
             UikaError: it is not two numbers i/n with 0 <= i < n.
         """
-        first, _, count = self.shard.partition("/")
-        if not (first.isdecimal() and count.isdecimal() and int(first) < int(count)):
-            raise UikaError(f"shard must be i/n with 0 <= i < n, such as 0/2, not '{self.shard}'")
-        return int(first), int(count)
+        return shard_part(self.shard)
 
 
 @dataclass(frozen=True)
@@ -100,6 +97,18 @@ def synthesize(settings: Synthesis, head: HeadModel | None = None, progress: boo
             _make(root, identity, settings, model, bar)
             made += 1
     return SynthesisReport(made, kept, made * settings.views * settings.frames)
+
+
+def shard_part(text: str, name: str = "shard") -> tuple[int, int]:
+    """The i and n of "i/n".
+
+    Raises:
+        UikaError: it is not two numbers i/n with 0 <= i < n; the message says `name`.
+    """
+    first, _, count = text.partition("/")
+    if not (first.isdecimal() and count.isdecimal() and int(first) < int(count)):
+        raise UikaError(f"{name} must be i/n with 0 <= i < n, such as 0/2, not '{text}'")
+    return int(first), int(count)
 
 
 def identity_name(identity: int) -> str:

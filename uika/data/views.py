@@ -14,7 +14,7 @@ from uika.data.head_crop import Square, head_square
 from uika.head import Camera, HeadModel
 
 SOLID = 0.98  # mask from which a pixel shows the person alone
-_REACH = 3  # pixels that colours are continued beyond it
+_REACH = 8  # pixels that colours are continued beyond it
 _ZOOM, _SHIFT = (0.85, 1.2), 0.05  # of a jittered crop, relative to the picture
 
 
@@ -37,27 +37,33 @@ class View:
             planes = functional.interpolate(planes, size=(size, size), mode="bilinear", antialias=True)[0]
         self.image, self.mask = planes[:3], planes[3]
         self.camera = square["camera"].resized(size, size)
-        self.key = sample.key
+        self.key, self.sample = sample.key, sample
         self.parameters, self.static_offset = sample.parameters, sample.static_offset
         self.uv: Tensor | None = None
         if "uv" in square:
             self.uv = functional.interpolate(square["uv"][None], size=(size, size), mode="nearest-exact")[0]
 
-    def over(self, background: Tensor) -> Tensor:
-        """The picture [3,S,S] on a colour [3]."""
-        return self.image * self.mask + background[:, None, None] * (1 - self.mask)
+    def over(self, background: Tensor, image: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+        """The picture [3,S,S] on a colour [3], or another image [3,S,S] or mask [S,S] in the place of the own one."""
+        image, mask = self.image if image is None else image, self.mask if mask is None else mask
+        return image * mask + background[:, None, None] * (1 - mask)
 
     def jitter(self, random: np.random.Generator) -> None:
         """Crop at random; the camera follows."""
         size = self.mask.shape[-1]
         side = size * random.uniform(*_ZOOM)
         x, y = ((size - side) / 2 + size * random.uniform(-_SHIFT, _SHIFT) for _ in range(2))
+        self.crop((x, y, side))
+
+    def crop(self, square: tuple[float, float, float]) -> None:
+        """Cut out a square (x0, y0, side) in pixels, which may reach outside, at the same size; the camera follows."""
+        x, y, side = square
+        size = self.mask.shape[-1]
         place = (torch.arange(size) + 0.5) / size * side
         grid = torch.stack(torch.meshgrid(place + x, place + y, indexing="xy"), -1)[None] / size * 2 - 1
-        planes = torch.cat((self.image, self.mask[None]))[None]
-        smooth = functional.grid_sample(planes, grid, align_corners=False, padding_mode="zeros")[0]
-        # Colours are needed as far as the mask reaches, which has faded to nothing at the border of the picture.
-        self.image, self.mask = smooth[:3], smooth[3]
+        # Nobody is known to be outside, but colours go on, as they do beyond the person's edge.
+        self.image = functional.grid_sample(self.image[None], grid, align_corners=False, padding_mode="border")[0]
+        self.mask = functional.grid_sample(self.mask[None, None], grid, align_corners=False)[0, 0]
         if self.uv is not None:
             known = torch.where(torch.isfinite(self.uv), self.uv, -9.0)[None]
             picked = functional.grid_sample(known, grid, mode="nearest", align_corners=False, padding_mode="zeros")[0]

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+Scope = Literal["all", "face_colors", "unseen_colors"]
+SCOPES: tuple[Scope, ...] = ("all", "face_colors", "unseen_colors")
+
 
 @dataclass(frozen=True)
 class BackboneConfig:
@@ -129,8 +132,9 @@ class ModelConfig:
     detail            share of the completed observation's fine relief of colours that predicted colours take over; a
                       network that is trained on mean errors paints smooth; not in the paper
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
-    scope             "all", or "face_colors": what is predicted counts for the colours of the face alone, everything
-                      else stays the surface with its completed observation; for weights that lose elsewhere
+    scope             what predictions count for: "all"; "face_colors", the colours of the face alone; or
+                      "unseen_colors", colours as far as no photo shows them. Everything else stays the surface with its
+                      completed observation, as without a network
     canonical         surface that Gaussians start on and are moved with: "personal", the head with the person's
                       identity and hair, or "template", the mean head, as in the paper, where offsets hold the identity
     """
@@ -155,7 +159,7 @@ class ModelConfig:
     palette: int = 0
     detail: float = 0.0
     fusion: Literal["learned", "fixed"] = "learned"
-    scope: Literal["all", "face_colors"] = "all"
+    scope: Scope = "all"
     canonical: Literal["personal", "template"] = "personal"
 
     def __post_init__(self) -> None:
@@ -172,7 +176,7 @@ class ModelConfig:
             (max(self.outputs) == self.layers, "the last of outputs must be layers"),
             (self.token_grid % 2 == 0, "token_grid must be even"),
             (self.fusion in ("learned", "fixed"), 'fusion must be "learned" or "fixed"'),
-            (self.scope in ("all", "face_colors"), 'scope must be "all" or "face_colors"'),
+            (self.scope in SCOPES, f"scope must be one of {', '.join(SCOPES)}"),
             (self.canonical in ("personal", "template"), 'canonical must be "personal" or "template"'),
             (0 <= self.palette <= 64, "palette must lie in 0..64"),
             (0 <= self.detail <= 1, "detail must lie in [0,1]"),

@@ -32,8 +32,10 @@ class GaussianDecoder(nn.Module):
         if self.gs_net.palette:
             self.palette = Palette(config.dpt_features, config.palette)
 
-    def forward(self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
-        """Tokens of four depths, observed [B,4,S,S], texel [M]."""
+    def forward(
+        self, tokens: list[Tensor], observed: Tensor, texel: Tensor, surface: SurfaceTexels, known: Tensor
+    ) -> Attributes:
+        """Tokens of four depths, observed [B,4,S,S], texel [M], known [B,1,S,S] as in `Observation`."""
         maps = [observed] if self.aggregation else []
         if self.surface and surface.lift is not None and surface.shape is not None:
             stand = torch.cat((_LIFT_UNIT * surface.lift, _SHAPE_UNIT * surface.shape))
@@ -55,19 +57,22 @@ class GaussianDecoder(nn.Module):
             relief = _gather(_fine(observed[:, :3], texel), texel)
             colors = result.colors + self.detail * result.fusion_weight[..., None] * relief
             result = result._replace(colors=colors.clamp(0, 1))
-        return result if self.scope == "all" else self._face_colors(result, seen[..., :3], texel, surface)
-
-    def _face_colors(self, result: Attributes, seen: Tensor, texel: Tensor, surface: SurfaceTexels) -> Attributes:
-        """The surface in the colours of the observation [B,M,3], predicted ones on the face alone."""
+        if self.scope == "all":
+            return result
+        if self.scope == "unseen_colors":
+            return self._colors_alone(result, seen[..., :3], 1 - _gather(known, texel).to(seen.dtype), surface)
         assert surface.face is not None
-        face = _gather(surface.face[None], texel)
+        return self._colors_alone(result, seen[..., :3], _gather(surface.face[None], texel), surface)
+
+    def _colors_alone(self, result: Attributes, seen: Tensor, share: Tensor, surface: SurfaceTexels) -> Attributes:
+        """The surface in the colours of the observation [B,M,3], with a share [B or 1,M,1] of predicted ones."""
         return Attributes(
             offsets=torch.zeros_like(result.offsets),
             quats=surface.quats.expand_as(result.quats),
             scales=surface.scales.expand_as(result.scales),
             opacities=torch.full_like(result.opacities, self.init_opacity),
-            colors=torch.lerp(seen, result.colors, face),
-            fusion_weight=result.fusion_weight * face[..., 0],
+            colors=torch.lerp(seen, result.colors, share),
+            fusion_weight=result.fusion_weight * share[..., 0],
         )
 
 

@@ -16,7 +16,8 @@ class CanonicalGaussians:
 
     means [B,M,3] metres, quats [B,M,4] wxyz unit, scales [B,M,3] metres, opacities [B,M], colors [B,M,3] in [0,1],
     offsets [B,M,3] metres (means minus surface points), fusion_weight [B,M] share of the predicted colour,
-    aggregate [B,3,S,S] and confidence [B,1,S,S] the UV observation the colours start from,
+    aggregate [B,3,S,S] and confidence [B,1,S,S] the UV observation the colours start from, known [B,1,S,S] how far it
+    is what the photos show at that very place,
     report: counts of what was skipped or filled (see `Reconstructor.forward`).
     """
 
@@ -29,6 +30,7 @@ class CanonicalGaussians:
     fusion_weight: Tensor
     aggregate: Tensor
     confidence: Tensor
+    known: Tensor
     report: Mapping[str, int]
 
     def __iter__(self) -> Iterator[Tensor]:

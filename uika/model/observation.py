@@ -21,6 +21,7 @@ class Observation(NamedTuple):
 
     color: Tensor  # [B,3,S,S] aggregate, completed where the config asks for it
     confidence: Tensor  # [B,1,S,S]
+    known: Tensor  # [B,1,S,S] in [0,1], how far `color` is what the photos show at that very place
     report: dict[str, int]
 
 
@@ -35,8 +36,8 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
     pooled = pool(total, normalization=config.normalization, close_radius=config.close_radius, valid=valid)
     empty = int(((pooled.hits <= 0) & valid).sum())
     color = pooled.rgb
+    share = (pooled.trust / config.full_trust).clamp(0, 1)
     if config.fill:
-        share = (pooled.trust / config.full_trust).clamp(0, 1)
         if surface.face is not None:
             # Lids and lips have gaps that are none of the photo's: what they hide must not be painted over.
             color, share = close_gaps(color, share, valid & (surface.face[0] < SIDE), GAP)
@@ -50,7 +51,7 @@ def observe(config: UvConfig, views: Sequence[Sums], texel: Tensor, surface: Sur
         "empty_texels": empty,
         "completed_texels": empty if config.fill else 0,
     }
-    return Observation(color, pooled.confidence, report)
+    return Observation(color, pooled.confidence, share * valid, report)
 
 
 def together(views: Sequence[Sums]) -> Sums:

@@ -132,7 +132,8 @@ class Reconstructor(nn.Module):
         with arithmetic(self.precision, texel.device):
             tokens = self._attend([views[-(newcomers or 0) :] for views in items], kept, memory)
             observed = torch.cat([color, confidence], dim=1)
-            result = self.gs_decoder(tokens, observed, texel, surface)
+            known = torch.cat([each.known for each in seen])
+            result = self.gs_decoder(tokens, observed, texel, surface, known)
         views = [view for item in items for view in item]
         used = sum(len(view.screen) + (0 if view.uv is None else len(view.uv)) for view in views)
         patches = sum(view.patches for view in views)
@@ -154,6 +155,7 @@ class Reconstructor(nn.Module):
             fusion_weight=result.fusion_weight,
             aggregate=color,
             confidence=confidence,
+            known=known,
             report=report,
         )
 
@@ -221,7 +223,7 @@ class Reconstructor(nn.Module):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
-        needed = {"lift": self.config.surface, "shape": self.config.surface, "face": self.config.scope != "all"}
+        needed = {"lift": self.config.surface, "shape": self.config.surface, "face": self.config.scope == "face_colors"}
         for name, wanted in needed.items():
             if wanted and getattr(surface, name) is None:
                 raise ValueError(f"surface.{name} is missing, which a model with this config needs")

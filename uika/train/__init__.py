@@ -3,10 +3,12 @@
 from uika.data.datasets import SYNTHETIC, Stored, Synthetic
 from uika.model.estimator_file import load_estimator
 from uika.train.config import TRAINING, LossWeights, TrainConfig
-from uika.train.dataset import Item, ItemMaker
+from uika.train.dataset import ItemMaker
+from uika.train.item import Item
 from uika.train.loop import MODEL_FILE, Setup, TrainingError, train
 from uika.train.optimiser import batch_size, learning_rate
 from uika.train.parallel import Group, join_group, leave_group
+from uika.train.prepared import PreparedItems
 from uika.train.sampler import Draw, Sampler, SamplerConfig
 
 __all__ = [
@@ -18,6 +20,7 @@ __all__ = [
     "Item",
     "ItemMaker",
     "LossWeights",
+    "PreparedItems",
     "Sampler",
     "SamplerConfig",
     "Setup",

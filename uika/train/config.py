@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from uika.errors import UikaError
 from uika.model import PRESETS, ModelConfig
+from uika.model.config import Scope
 
 Part = Literal["reconstructor", "estimator"]
 
@@ -28,6 +29,8 @@ class LossWeights:
     entropy: float = 0.0
     alpha: float = 0.1
     atlas: float = 0.0  # of colours against the true ones of the atlas, where data with exact correspondence has them
+    atlas_seen: float = 1.0  # share of that weight which texels have that the photos show
+    change: float = 0.0  # of colours off what the photos show of a texel
     relief: float = 0.0  # of positions in metres against the true surface
     variation: float = 0.001  # of the estimator's maps
 
@@ -38,6 +41,7 @@ class TrainConfig:
 
     preset: str = "tiny"
     architecture: ModelConfig | None = None  # of the reconstructor in the place of the preset's, for ablations
+    scope: Scope = "all"  # what the preset's predictions count for
     part: Part = "reconstructor"
     # First logit of the fusion weight where nothing was seen, and its fall with confidence: untrained presets keep the
     # weight so low that predicted colours would not learn.
@@ -54,10 +58,15 @@ class TrainConfig:
     size: int = 256  # pixels of photos and pictures
     texels: int = 0  # side of the atlas in training, which may be coarser than in use; 0 for the preset's
     atlas_views: int = 0  # more pictures per head that only tell the atlas's true colours
-    fitted: float = 0.5  # share of heads whose correspondence comes from a landmark fit
+    own: int = 0  # most photos of a head whose own views, with the cameras in use, are among the pictures
+    fitted: float = 0.5  # share of heads whose correspondence comes from a fit
+    photographed: bool = False  # fit photos as in use: detector, mattes, refinement; else known landmarks with errors
+    # What pictures show of the person: what masks say, or what splats of the true surface, which must be known, cover.
+    outline: Literal["mask", "splats"] = "mask"
     facing: float = 0.25  # least cosine between face and camera of a photo; -1 takes every view
     backgrounds: tuple[float, ...] = (0.0, 0.5, 1.0, 1.0)  # grey levels behind photos; in use they are white
     estimator: str = ""  # digest of the file whose estimator finds the correspondence of photos; empty for none
+    variants: int = 2  # items of each person and number of photos where they are prepared and kept
     augment: bool = True  # what cameras, files and hands do to photos, and crops
     # Optimiser
     optimizer: Literal["adamw", "adam"] = "adamw"
@@ -80,11 +89,11 @@ class TrainConfig:
         """Refuse values that cannot work, naming the field."""
         if self.preset not in PRESETS:
             raise UikaError(f"preset must be one of {', '.join(PRESETS)}, not '{self.preset}'")
-        for name in ("steps", "sources", "targets", "images", "items", "save_every", "keep", "patience"):
+        for name in ("steps", "sources", "targets", "images", "items", "variants", "save_every", "keep", "patience"):
             if getattr(self, name) < 1:
                 raise UikaError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.texels < 0 or self.atlas_views < 0:
-            raise UikaError("texels and atlas_views must not be negative")
+        if min(self.texels, self.atlas_views, self.own) < 0:
+            raise UikaError("texels, atlas_views and own must not be negative")
         if self.size < 32 or self.size % 16:
             raise UikaError(f"size must be a multiple of 16 and at least 32 pixels, not {self.size}")
         for name in ("fitted", "ema"):
@@ -113,7 +122,8 @@ class TrainConfig:
     @property
     def finished(self) -> ModelConfig:
         """Architecture of the reconstructor in use; no weight depends on the side of the atlas."""
-        return PRESETS[self.preset] if self.architecture is None else self.architecture
+        preset = dataclasses.replace(PRESETS[self.preset], scope=self.scope)
+        return preset if self.architecture is None else self.architecture
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary for JSON."""
@@ -125,17 +135,24 @@ _LARGE = {"sources": 16, "targets": 8, "images": 16, "items": 8, "size": 512, "w
 TRAINING: dict[str, TrainConfig] = {
     "tiny": TrainConfig(
         steps=4000,
+        scope="unseen_colors",
+        sources=3,
         targets=1,
+        own=1,
         images=3,
         items=3,
-        fitted=0.5,
+        size=128,
+        fitted=0.7,
+        photographed=True,
+        outline="splats",
+        backgrounds=(1.0,),
         texels=192,
         least_scale=0.75,
         atlas_views=4,
         learning_rate=2e-3,
         warmup=50,
         precision="float32",
-        losses=LossWeights(alpha=0.3, atlas=1.0, relief=15.0),
+        losses=LossWeights(alpha=1.0, atlas=1.0, atlas_seen=0.1, change=0.5, relief=15.0),
     ),
     "base": TrainConfig(preset="base", steps=100_000, **_LARGE),  # type: ignore[arg-type]
     # The paper's recipe as printed; docs/paper.md has a row for each value.

@@ -20,19 +20,21 @@ from uika.metrics.lpips import Lpips
 from uika.model import computes_bfloat16
 from uika.model.dinov3 import load_backbone
 from uika.model.estimator_file import check_estimator_head, read_estimator
+from uika.train.batches import batches_of
 from uika.train.checkpoint import Checkpoints, Progress, read_progress
 from uika.train.config import TrainConfig
-from uika.train.dataset import Item, ItemMaker
+from uika.train.dataset import ItemMaker
 from uika.train.export import export, load_start
+from uika.train.item import Item
 from uika.train.logbook import Clock, Logbook
 from uika.train.optimiser import RunningMean, learning_rate, make_optimizer
 from uika.train.parallel import Group, Sharding, distribute
+from uika.train.prepared import PreparedItems
 from uika.train.requirements import backbone_of, check_start, file_digest, summary
-from uika.train.sampler import Draw, Sampler, SamplerConfig
+from uika.train.sampler import Sampler, SamplerConfig
 from uika.train.tasks import Task, blocks, judge, make_task, recompute_activations
 
 MODEL_FILE = "model.safetensors"
-_PREFETCH = 4  # batches that each worker makes ahead
 _FREE = ("steps", "save_every", "keep", "histogram_every", "patience")  # may change when a run is continued
 
 
@@ -49,6 +51,7 @@ class Setup:
     backbone: Path | None = None  # weights of the frozen backbone; a model to start from and a checkpoint have them
     estimator: Path | None = None  # finds the correspondence of photos in the place of exact and fitted ones
     init: Path | None = None  # a model file whose weights a new training starts from
+    items: Path | None = None  # folder of prepared items; what is missing there is made and kept
     progress: bool = True
 
 
@@ -114,7 +117,8 @@ def train(config: TrainConfig, people: People, setup: Setup, group: Group, head:
         if latest is not None:
             book.say(f"resumed: {latest}, step {progress.step:,}")
     trainer = _Trainer(config, task, network, optimizer, mean, group, book)
-    batches = _batches(ItemMaker(people, config), sampler, config.steps - progress.step, setup.workers)
+    maker = ItemMaker(people, config) if setup.items is None else PreparedItems(setup.items, people, config)
+    batches = batches_of(maker, sampler, config.steps - progress.step, setup.workers)
     try:
         while progress.step < config.steps:
             progress = trainer.step(batches, progress, sampler)
@@ -191,7 +195,9 @@ class _Trainer:
             gradients += [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
         with clock.stage("network_backward"):
             # Also when the loss is not finite: with several processes all must come by here.
-            torch.autograd.backward([tensor for output in outputs for tensor in output], gradients)
+            tensors = [tensor for output in outputs for tensor in output]
+            learned = [pair for pair in zip(tensors, gradients, strict=True) if pair[0].requires_grad]
+            torch.autograd.backward([tensor for tensor, _ in learned], [gradient for _, gradient in learned])
         return sums, outputs
 
     def _finish(
@@ -253,43 +259,6 @@ def _latest(checkpoints: Checkpoints, config: TrainConfig, setup: Setup) -> Path
                 f"{latest}: was trained with {name} {stored.get(name)}, not {value}; give the same values to resume"
             )
     return latest
-
-
-def _batches(maker: ItemMaker, sampler: Sampler, steps: int, workers: int) -> Iterator[list[Item]]:
-    from torch.utils.data import DataLoader
-
-    order = _Order(sampler, steps)
-    if sampler.config.fixed:
-        same = [maker[draw] for draw in next(iter(sampler))]
-        yield from (same for _ in range(steps))
-        return
-    if workers == 0:
-        for draws in order:
-            yield [maker[draw] for draw in draws]
-        return
-    loader = DataLoader(
-        maker,
-        batch_sampler=order,
-        num_workers=workers,
-        collate_fn=list,
-        prefetch_factor=_PREFETCH,
-        multiprocessing_context="spawn",  # a forked process cannot use Dr.Jit's threads
-    )
-    yield from loader
-
-
-class _Order:
-    """The draws that are left, for a loader's processes."""
-
-    def __init__(self, sampler: Sampler, steps: int) -> None:
-        self._sampler, self._steps = sampler, steps
-
-    def __iter__(self) -> Iterator[list[Draw]]:
-        for _, draws in zip(range(self._steps), self._sampler, strict=False):
-            yield draws
-
-    def __len__(self) -> int:
-        return self._steps
 
 
 def _whole(tensor: Tensor) -> Tensor:

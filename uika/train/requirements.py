@@ -92,4 +92,5 @@ def backbone_of(model: nn.Module) -> VisionTransformer:
 def _correspondence(config: TrainConfig, estimator: Path | None) -> str:
     if estimator is not None:
         return "of the estimator"
-    return f"exact, and fitted to landmarks for {config.fitted:.0%} of the heads"
+    fitted = "photos as in use" if config.photographed else "landmarks with errors"
+    return f"exact, and fitted to {fitted} for {config.fitted:.0%} of the heads"

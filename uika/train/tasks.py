@@ -16,7 +16,7 @@ from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
 from uika.model.estimator_file import AnyEstimator
 from uika.train.config import TrainConfig
-from uika.train.dataset import Item
+from uika.train.item import Item
 from uika.train.losses import alpha_loss, gradient_loss, l1, offset_loss, opacity_entropy, ssim_loss, variation
 
 
@@ -52,7 +52,7 @@ class GaussianNetwork(nn.Module):
         self._mirror, self._regions = mirror_map(head, size), regions(head, self._binding)
 
     def forward(self, items: Sequence[Item]) -> list[tuple[Tensor, ...]]:
-        """Means, quats, scales, opacities, colours and offsets of each item."""
+        """Means, quats, scales, opacities, colours, offsets, the completed observation and its share [M] of each."""
         return [self._one(item) for item in items]
 
     def _one(self, item: Item) -> tuple[Tensor, ...]:
@@ -71,7 +71,8 @@ class GaussianNetwork(nn.Module):
         views = self.model.encode(*photos)
         result = self.model.decode(views, self._binding.texel.to(device), surface)
         tensors = (result.means, result.quats, result.scales, result.opacities, result.colors, result.offsets)
-        return tuple(tensor[0].float() for tensor in tensors)
+        seen = torch.cat((result.aggregate, result.known), dim=1).flatten(2)[0, :, self._binding.texel.to(device)].mT
+        return *(tensor[0].float() for tensor in tensors), seen[:, :3], seen[:, 3]
 
     def _located(self, item: Item) -> tuple[Tensor, Tensor]:
         """UV maps [1,V,2,S,S] of the photos and the trust [1,V,1,S,S] in them."""
@@ -103,7 +104,7 @@ class ReconstructionTask:
     def terms(self, output: Sequence[Tensor], item: Item) -> dict[str, Tensor]:
         """Weighted losses, and `psnr` in dB for the log."""
         image, alpha = self.render(output, item)
-        means, _, _, opacities, colors, offsets = output
+        means, _, _, opacities, colors, offsets, observed, known = output
         weights = self._losses
         terms = {
             "l1": weights.l1 * l1(image, item.pictures),
@@ -119,23 +120,26 @@ class ReconstructionTask:
         if weights.alpha:
             terms["alpha"] = weights.alpha * alpha_loss(alpha, item.coverage)
         if weights.atlas and len(item.texture):
-            terms["atlas"] = weights.atlas * self._atlas(colors, item.texture)
+            terms["atlas"] = weights.atlas * self._atlas(colors, item.texture, 1 - (1 - weights.atlas_seen) * known)
+        if weights.change:
+            terms["change"] = weights.change * ((colors - observed).abs() * known[:, None]).mean()
         if weights.relief:
             terms["relief"] = weights.relief * l1(means, item.relief)
-        square = (image.detach() - item.pictures).square().mean(dim=(1, 2, 3))
-        return terms | {"psnr": (-10 * torch.log10(square.clamp_min(1e-10))).mean()}
+        square = (image.detach() - item.pictures).square().mean(dim=1, keepdim=True)
+        inside = (square * item.person).sum((1, 2, 3)) / item.person.sum((1, 2, 3)).clamp_min(1)
+        return terms | {"psnr": _decibel(square.mean(dim=(1, 2, 3))), "psnr_masked": _decibel(inside)}
 
-    def _atlas(self, colors: Tensor, texture: Tensor) -> Tensor:
-        """Mean distance of colours [M,3] from the true ones where those are known."""
+    def _atlas(self, colors: Tensor, texture: Tensor, weight: Tensor) -> Tensor:
+        """Mean distance of colours [M,3] from the true ones where those are known, by a weight [M]."""
         truth = texture.flatten(1)[:, self._binding.texel.to(texture.device)].mT
-        known = truth[:, 3:]
+        known = truth[:, 3:] * weight[:, None]
         return ((colors - truth[:, :3]).abs() * known).sum() / (3 * known.sum()).clamp_min(1)
 
     def render(self, output: Sequence[Tensor], item: Item) -> tuple[Tensor, Tensor]:
         """Pictures [D,3,S,S] and coverage [D,1,S,S] of Gaussians in an item's poses; equal poses share one call."""
         from drjit_splat import rasterization
 
-        means, quats, scales, opacities, colors, _ = output
+        means, quats, scales, opacities, colors = output[:5]
         binding, device = self._binding, means.device
         images: list[Tensor | None] = [None] * len(item.pictures)
         alphas: list[Tensor | None] = [None] * len(item.pictures)
@@ -166,7 +170,7 @@ class ReconstructionTask:
 
     def measures(self, output: Sequence[Tensor]) -> dict[str, Tensor]:
         """Attributes of the Gaussians."""
-        _, _, scales, opacities, colors, offsets = output
+        _, _, scales, opacities, colors, offsets, *_ = output
         return {
             "offset_mm": 1000 * offsets.norm(dim=-1),
             "log10_scale": scales.clamp_min(1e-8).log10(),
@@ -218,7 +222,7 @@ class EstimatorTask:
         return {"uv": output[0]}
 
 
-LOGGED = ("psnr", "error")  # terms that are no losses
+LOGGED = ("psnr", "psnr_masked", "error")  # terms that are no losses
 
 
 @dataclass(frozen=True)
@@ -262,6 +266,11 @@ def blocks(model: nn.Module) -> list[nn.Module]:
     """The repeated blocks of a model."""
     lists = [module for module in model.modules() if isinstance(module, nn.ModuleList)]
     return [block for each in lists for block in each if len(list(block.children())) > 1]
+
+
+def _decibel(squares: Tensor) -> Tensor:
+    """Mean PSNR of mean squared errors [D]."""
+    return (-10 * torch.log10(squares.clamp_min(1e-10))).mean()
 
 
 def _same_poses(posed: Tensor) -> list[list[int]]:
