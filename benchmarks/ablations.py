@@ -1,7 +1,8 @@
 """The paper's ablations in small: `python -m benchmarks.ablations --train PEOPLE --data HELD_OUT`.
 
-Each variant is trained from nothing with the same budget, seed and order of data, then judged on the same photos and
-targets of people it never saw. Finished trainings and verdicts under `--runs` are kept, so that a second call goes on.
+Each variant is trained from nothing with the same budget and the same order of data, once for each of several seeds,
+then judged on the same photos and targets of people it never saw: over whole pictures, inside the person's mask, and on
+the texels that no photo shows. Finished trainings and verdicts under `--runs` are kept, so that a second call goes on.
 """
 
 from __future__ import annotations
@@ -11,16 +12,18 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.harness import markdown, save
+from uika.canonical.surface import canonical_binding
 from uika.head import load_head
 from uika.io.progress import counted
-from uika.metrics import flip, psnr, ssim
 from uika.model import PRESETS, load_checkpoint
-from uika.train import MODEL_FILE, TRAINING, Group, Setup, Stored, TrainConfig, train
+from uika.train import MODEL_FILE, TRAINING, Group, Item, Setup, Stored, TrainConfig, train
 from uika.train.dataset import ItemMaker
 from uika.train.sampler import Draw
 from uika.train.tasks import ReconstructionTask
@@ -28,13 +31,15 @@ from uika.train.tasks import ReconstructionTask
 SIZE, TEXELS = 128, 128
 VIEWS = (1, 4)
 BASE = replace(PRESETS["tiny"], image_size=SIZE)
-METRICS = {"PSNR": psnr, "SSIM": ssim, "FLIP": flip}
-VARIANTS: Mapping[str, Mapping[str, Any]] = {
-    "full": {},
-    "w/o UV attention": {"uv_attention": False},
-    "w/o aggregation": {"aggregation": False},
-    "fixed fusion weight": {"fusion": "fixed"},
-    "10 % of the identities": {},
+METRICS = ("psnr", "psnr_masked", "psnr_unseen")
+# What of the architecture and of the training a variant changes.
+VARIANTS: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+    "full": ({}, {}),
+    "w/o UV attention": ({"uv_attention": False}, {}),
+    "w/o aggregation": ({"aggregation": False}, {}),
+    "fixed fusion weight": ({"fusion": "fixed"}, {}),
+    "10 % of the identities": ({}, {}),
+    "trained on exact correspondence": ({}, {"fitted": 0.0}),
 }
 
 
@@ -51,26 +56,19 @@ class Some:
         return self._people[index]
 
 
-def config_of(name: str, steps: int) -> TrainConfig:
+def config_of(name: str, steps: int, seed: int) -> TrainConfig:
     """The training of a variant."""
-    return replace(
-        TRAINING["tiny"],
-        architecture=replace(BASE, **VARIANTS[name]),
-        steps=steps,
-        size=SIZE,
-        texels=TEXELS,
-        fitted=0.0,
-        ema=0.98,
-        save_every=100,
-        keep=1,
-    )
+    architecture, training = VARIANTS[name]
+    config = replace(TRAINING["tiny"], architecture=replace(BASE, **architecture), size=SIZE, texels=TEXELS)
+    return replace(config, steps=steps, seed=seed, ema=0.98, save_every=100, keep=1, **training)
 
 
 @torch.no_grad()
 def judge(model: Path, config: TrainConfig, people: Stored, count: int) -> list[dict[str, Any]]:
     """Scores of a model for each person and number of photos; photos and targets depend on the person alone."""
     head = load_head().without_bust
-    plain = replace(config, augment=False, targets=4, losses=replace(config.losses, atlas=0.0))
+    # One seed for all, so that all are judged on the same photos, fitted as in use.
+    plain = replace(config, augment=False, targets=4, own=0, fitted=1.0, seed=0)
     task, maker = ReconstructionTask(plain, head), ItemMaker(people, plain)
     task.model.load_state_dict(load_checkpoint(model).state_dict())
     task.network.eval()
@@ -78,25 +76,32 @@ def judge(model: Path, config: TrainConfig, people: Stored, count: int) -> list[
     for person in range(count):
         for views in VIEWS:
             item = maker[Draw(0, person, views, 1000 + person)]
-            images, _ = task.render(task.network([item])[0], item)
-            pairs = [
-                (image.permute(1, 2, 0).clamp(0, 1), truth.permute(1, 2, 0))
-                for image, truth in zip(images, item.pictures, strict=True)
-            ]
-            scores = {name: [score(*pair) for pair in pairs] for name, score in METRICS.items()}
-            rows.append({"person": person, "views": views} | {k: float(sum(v) / len(v)) for k, v in scores.items()})
+            output = task.network([item])[0]
+            terms = task.terms(output, item)
+            scores = {name: float(terms[name]) for name in METRICS[:2]}
+            rows.append({"person": person, "views": views, METRICS[2]: unseen(task, output, item), **scores})
     return rows
 
 
-def table(verdicts: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Means over people as Markdown."""
+def unseen(task: ReconstructionTask, output: Sequence[Tensor], item: Item) -> float:
+    """PSNR of the colours of texels that no photo shows, where their true colour is known."""
+    texel = canonical_binding(load_head().without_bust, "personal", item.texture.shape[-1]).texel
+    truth = item.texture.flatten(1)[:, texel].mT
+    weight = truth[:, 3] * (1 - output[7])
+    square = (output[4] - truth[:, :3]).square().mean(1)
+    return float(-10 * torch.log10((square * weight).sum() / weight.sum().clamp_min(1e-6)))
+
+
+def table(verdicts: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> str:
+    """Means over people, then over seeds with the spread of the seeds, as Markdown."""
     lines = []
-    for name, rows in verdicts.items():
+    for name, seeds in verdicts.items():
         line: dict[str, object] = {"variant": name}
         for views in VIEWS:
-            own = [row for row in rows if row["views"] == views]
-            for metric, digits in (("PSNR", 2), ("SSIM", 3), ("FLIP", 3)):
-                line[f"{metric}, N = {views}"] = round(sum(row[metric] for row in own) / len(own), digits)
+            for metric in METRICS:
+                each = [mean(row[metric] for row in rows if row["views"] == views) for rows in seeds]
+                spread = f" ± {stdev(each):.2f}" if len(each) > 1 else ""
+                line[f"{metric.replace('psnr', 'PSNR').replace('_', ' ')}, N = {views}"] = f"{mean(each):.2f}{spread}"
         lines.append(line)
     return markdown(lines)
 
@@ -106,24 +111,29 @@ def main() -> None:
     parser.add_argument("--train", type=Path, required=True)
     parser.add_argument("--data", type=Path, required=True, help="held-out people")
     parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--people", type=int, default=24, help="held-out people to judge with")
     parser.add_argument("--runs", type=Path, default=Path("out/ablations"))
     options = parser.parse_args()
     everyone, held_out = Stored([options.train]), Stored([options.data])
-    verdicts: dict[str, list[dict[str, Any]]] = {}
-    for name in counted(list(VARIANTS), True, len(VARIANTS), "variants"):
-        config = config_of(name, options.steps)
-        folder = options.runs / name.replace("/", "").replace(" ", "_")
+    verdicts: dict[str, list[list[dict[str, Any]]]] = {name: [] for name in VARIANTS}
+    tasks = [(name, seed) for seed in range(options.seeds) for name in VARIANTS]
+    for name, seed in counted(tasks, True, len(tasks), "trainings"):
+        config = config_of(name, options.steps, seed)
+        folder = options.runs / f"{name.replace('/', '').replace(' ', '_')}-{seed}"
         verdict = folder / "verdict.json"
         if not verdict.exists():
-            share = len(everyone) // 10 if name.startswith("10 %") else len(everyone)
+            share = max(1, len(everyone) // 10) if name.startswith("10 %") else len(everyone)
             alone = Group(0, 1, torch.device("cpu"))
-            model = train(config, Some(everyone, share), Setup(folder, resume=(folder / "checkpoints").exists()), alone)
+            # The items of a seed are shared by its variants, but where correspondence is what differs.
+            items = options.runs / f"items-{seed}-{config.fitted:g}"
+            setup = Setup(folder, workers=0, resume=(folder / "checkpoints").exists(), items=items)
+            model = train(config, Some(everyone, share), setup, alone)
             verdict.write_text(json.dumps(judge(model, config, held_out, options.people)))
-        verdicts[name] = json.loads(verdict.read_text())
+        verdicts[name].append(json.loads(verdict.read_text()))
     text = (
-        f"{options.steps} steps on {len(everyone)} people, {SIZE} x {SIZE} pixels, exact correspondence; "
-        f"{options.people} people never seen, four targets each.\n\n{table(verdicts)}"
+        f"{options.steps} steps on {len(everyone)} people, {SIZE} x {SIZE} pixels, {options.seeds} seeds; "
+        f"{options.people} people never seen, photos fitted as in use, four targets each.\n\n{table(verdicts)}"
     )
     save("ablations", "Ablations in small", text, {"verdicts": verdicts, "model_file": MODEL_FILE})
 

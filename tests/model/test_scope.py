@@ -32,6 +32,25 @@ def test_off_the_face_the_surface_keeps_its_observation(
     assert bool((kept.fusion_weight[face[..., 0] == 0] == 0).all())
 
 
+@torch.no_grad()
+def test_what_photos_show_keeps_its_colour(
+    small: ModelConfig, make_inputs: Make, perturb: Callable[[Reconstructor], Reconstructor]
+) -> None:
+    inputs = make_inputs()
+    surface, texel = inputs["surface"], inputs["texel"]
+    trusting = dataclasses.replace(small, gaussians=dataclasses.replace(small.gaussians, fusion_bias=1.0))
+    whole = perturb(build(trusting)).eval()(**inputs)
+    kept = perturb(build(dataclasses.replace(trusting, scope="unseen_colors"))).eval()(**inputs)
+    assert torch.equal(kept.means, surface.points)
+    assert bool((kept.opacities == small.gaussians.init_opacity).all())
+    known = kept.known.flatten(2)[:, :, texel].mT
+    seen = kept.aggregate.flatten(2)[:, :, texel].mT
+    torch.testing.assert_close(kept.colors, whole.colors + known * (seen - whole.colors), rtol=0, atol=1e-6)
+    assert bool((known == 1).any()) and bool((known == 0).any())
+    assert torch.equal(kept.colors[known[..., 0] == 1], seen[known[..., 0] == 1])
+    assert (kept.colors - seen).abs().amax() > 1e-2
+
+
 def test_a_surface_that_does_not_know_its_face_is_refused(small: ModelConfig, make_inputs: Make) -> None:
     inputs = make_inputs()
     inputs["surface"] = dataclasses.replace(inputs["surface"], face=None)

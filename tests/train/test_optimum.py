@@ -28,7 +28,8 @@ def exact() -> tuple[ReconstructionTask, Item, Output]:
     known = truth[:, 3]
     colors = torch.where(truth[:, 3:] > 0, truth[:, :3], truth[:, :3][known > 0].mean(0))
     opacities = torch.full((len(colors),), CONFIG.model.gaussians.init_opacity)
-    return task, item, (item.points, item.quats, item.scales, opacities, colors, torch.zeros_like(colors), colors, known)
+    still = torch.zeros_like(colors)
+    return task, item, (item.points, item.quats, item.scales, opacities, colors, still, colors, known)
 
 
 def inwards(output: Output, millimetres: float) -> Output:
@@ -69,7 +70,7 @@ def test_every_change_of_an_exact_head_costs(name: str, exact: tuple[Reconstruct
 
 
 def test_masks_alone_would_draw_an_exact_head_in(exact: tuple[ReconstructionTask, Item, Output]) -> None:
-    """Why pictures are compared with what splats of the true surface cover: the paper's way has its optimum elsewhere."""
+    """Why pictures are compared with what splats of the true surface cover: masks have their optimum elsewhere."""
     task, _, truth = exact
     item = ItemMaker(PaintedPeople(), replace(CONFIG, outline="mask"))[Draw(0, 0, 1, 3)]
     still, drawn_in = (task.terms(inwards(truth, value), item)["alpha"] for value in (0.0, 1.0))

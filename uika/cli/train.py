@@ -93,9 +93,9 @@ class Train:
             config = replace(config, sources=min(config.sources, config.images))
         if self.overfit:
             # The same pictures at every step, which alone count, and full speed soon: this shows that gradients arrive.
-            losses = replace(config.losses, atlas=0.0, relief=0.0)
+            losses = replace(config.losses, atlas=0.0, relief=0.0, change=0.0)
             config = replace(config, augment=False, fitted=0.0, losses=losses, ema=0.0, weight_decay=0.0)
-            config = replace(config, backgrounds=(1.0,))
+            config = replace(config, backgrounds=(1.0,), scope="all", own=0, outline="mask")
             config = replace(config, warmup=min(20, config.warmup))
         if "steps" in given:
             config = replace(config, warmup=min(config.warmup, max(1, config.steps // 10)))

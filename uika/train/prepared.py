@@ -117,7 +117,8 @@ def write_item(path: Path, item: Item) -> None:
     tensors = {name: value.contiguous().clone() for name, value in vars(item).items() if isinstance(value, Tensor)}
     if item.driving is not None:
         tensors |= {_DRIVING + name: value.contiguous().clone() for name, value in vars(item.driving).items()}
-    write_tensors(path, tensors, {"keys": json.dumps(item.keys), "notes": json.dumps(item.notes)})
+    # One entry: the order of several is chance, and equal items shall be equal files.
+    write_tensors(path, tensors, {"made from": json.dumps([item.keys, item.notes])})
 
 
 def read_item(path: Path) -> Item:
@@ -131,7 +132,7 @@ def read_item(path: Path) -> Item:
         raise FileNotFoundError(path)
     try:
         with safe_open(path, framework="pt") as file:
-            keys, notes = (tuple(json.loads(file.metadata()[name])) for name in ("keys", "notes"))
+            keys, notes = (tuple(names) for names in json.loads(file.metadata()["made from"]))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
         driving = {name.removeprefix(_DRIVING): tensors.pop(name) for name in list(tensors) if _DRIVING in name}
         return Item(keys, notes, **tensors, driving=HeadParameters(**driving) if driving else None)
@@ -143,7 +144,7 @@ def _settings(people: People, config: TrainConfig) -> dict[str, Any]:
     """What decides on the items, as JSON would give it back."""
     first = people[0].sample(0).image.contiguous().numpy()
     own = {name: getattr(config, name) for name in _FIELDS}
-    own |= {"people": len(people), "first_image": hashlib.sha256(first.tobytes()).hexdigest()[:16]}
+    own |= {"first_image": hashlib.sha256(first.tobytes()).hexdigest()[:16]}
     model = config.model
     own |= {"canonical": model.canonical, "map_size": model.map_size, "opacity": model.gaussians.init_opacity}
     own |= {"uv": asdict(model.uv), "head": load_head().without_bust.id, "atlas": bool(config.losses.atlas)}

@@ -96,6 +96,9 @@ class ReconstructionTask:
     ) -> None:
         """A fresh model of the preset; `perceptual` takes the place of the gradient loss, `estimator` that of fits."""
         self.model = build(config.model, config.seed)
+        if config.model.scope != "all":
+            for name in ("xyz", "opacity", "scaling", "rotation"):  # count for nothing
+                self.model.gs_decoder.gs_net.out_layers[name].requires_grad_(False)
         self.network = GaussianNetwork(self.model, head, estimator)
         self._head = head
         self._binding = canonical_binding(head, config.model.canonical, self.model.config.map_size)
