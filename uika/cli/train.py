@@ -87,7 +87,7 @@ class Train:
         config = replace(TRAINING[self.preset], part=self.part, seed=self.seed)
         if self.part == "estimator":
             # Maps are much cheaper than pictures of Gaussians; the released training has the same proportions.
-            config = replace(config, images=3 * config.images, items=2 * config.items)
+            config = replace(config, images=3 * config.images, items=2 * config.items, size=max(256, config.size))
         config = replace(config, **given)
         if "images" in given:  # one head may not have more photos than a step has
             config = replace(config, sources=min(config.sources, config.images))
