@@ -45,8 +45,9 @@ def test_what_photos_show_keeps_its_colour(
     assert bool((kept.opacities == small.gaussians.init_opacity).all())
     known = kept.known.flatten(2)[:, :, texel].mT
     seen = kept.aggregate.flatten(2)[:, :, texel].mT
-    torch.testing.assert_close(kept.colors, whole.colors + known * (seen - whole.colors), rtol=0, atol=1e-6)
-    assert bool((known == 1).any()) and bool((known == 0).any())
+    share = (1 - known) * (1 - surface.face.flatten()[texel][None, :, None])
+    torch.testing.assert_close(kept.colors, seen + share * (whole.colors - seen), rtol=0, atol=1e-6)
+    assert bool((known == 1).any()) and bool((share == 1).any())
     assert torch.equal(kept.colors[known[..., 0] == 1], seen[known[..., 0] == 1])
     assert (kept.colors - seen).abs().amax() > 1e-2
 

@@ -88,9 +88,15 @@ def surface_texels(
     surface = SurfaceTexels(points[None], quats[None], scales[None], mirror_map(head, size), regions(head, binding))
     deviation = (vertices - head.template)[head.faces[binding.triangle]] * binding.barycentric[..., None]
     shape = binding.to_map(deviation.sum(1))
-    face = binding.to_map(mask_at_texels(head, binding, "face")[:, None]) if "face" in head.masks else None
     lift = _lift(head, neutral, static_offset, binding)
-    return replace(surface, lift=lift, shape=shape, face=face), binding
+    return replace(surface, lift=lift, shape=shape, face=face_map(head, binding)), binding
+
+
+def face_map(head: HeadModel, binding: Binding) -> Tensor | None:
+    """How far each texel belongs to the face [1,S,S], 0 outside the atlas; None for a head that does not know."""
+    if "face" not in head.masks:
+        return None
+    return binding.to_map(mask_at_texels(head, binding, "face")[:, None])
 
 
 def template_texels(head: HeadModel, size: int) -> tuple[SurfaceTexels, Binding]:

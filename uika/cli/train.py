@@ -29,7 +29,7 @@ class Train:
     output: Annotated[Path, arg(aliases=["-o"])]
     """The run's folder, with the model in the end."""
     data: tuple[str, ...] = ("synthetic",)
-    """Folders of people, or "synthetic" ones."""
+    """Folders of people, or "synthetic"."""
     preset: Literal["tiny", "base", "paper"] = "tiny"
     """Size of the network, and its training."""
     part: Literal["reconstructor", "estimator", "correspondence"] = "reconstructor"
@@ -50,9 +50,9 @@ class Train:
     """Copies of the network, or one cut up."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    learning_rate: float | None = None
+    learning_rate: Annotated[float | None, arg(metavar="NUM")] = None
     """The highest; else the preset's own."""
-    images: int | None = None
+    images: Annotated[int | None, arg(metavar="INT")] = None
     """Photos per step and process."""
     size: int | None = None
     """Side of photos and pictures in pixels."""
@@ -60,11 +60,11 @@ class Train:
     """Steps from one checkpoint to the next."""
     init: Path | None = None
     """A model of the same kind to start from."""
-    items: Path | None = None
+    items: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder that keeps prepared items."""
-    prepare: str = ""
-    """I/N: only fill that folder with the items of every Nth person."""
-    lpips: Path | None = None
+    prepare: Annotated[str, arg(metavar="I/N")] = ""
+    """Only fill it, for every Nth person."""
+    lpips: Annotated[Path | None, arg(metavar="PATH")] = None
     """LPIPS weights, else gradients."""
     backbone: Annotated[Path | None, arg(metavar="PATH")] = None
     """DINOv3 weights, for base and paper."""

@@ -59,10 +59,11 @@ class GaussianDecoder(nn.Module):
             result = result._replace(colors=colors.clamp(0, 1))
         if self.scope == "all":
             return result
-        if self.scope == "unseen_colors":
-            return self._colors_alone(result, seen[..., :3], 1 - _gather(known, texel).to(seen.dtype), surface)
         assert surface.face is not None
-        return self._colors_alone(result, seen[..., :3], _gather(surface.face[None], texel), surface)
+        share = _gather(surface.face[None], texel)
+        if self.scope == "unseen_colors":
+            share = (1 - share) * (1 - _gather(known, texel).to(seen.dtype))
+        return self._colors_alone(result, seen[..., :3], share, surface)
 
     def _colors_alone(self, result: Attributes, seen: Tensor, share: Tensor, surface: SurfaceTexels) -> Attributes:
         """The surface in the colours of the observation [B,M,3], with a share [B or 1,M,1] of predicted ones."""

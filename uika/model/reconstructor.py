@@ -223,7 +223,7 @@ class Reconstructor(nn.Module):
             raise ValueError("images hold NaN or infinite values: every pixel, background included, needs a colour")
         if texel.ndim != 1 or texel.dtype != torch.int64:
             raise ValueError(f"texel must be int64 [M], got {texel.dtype} {list(texel.shape)}")
-        needed = {"lift": self.config.surface, "shape": self.config.surface, "face": self.config.scope == "face_colors"}
+        needed = {"lift": self.config.surface, "shape": self.config.surface, "face": self.config.scope != "all"}
         for name, wanted in needed.items():
             if wanted and getattr(surface, name) is None:
                 raise ValueError(f"surface.{name} is missing, which a model with this config needs")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from uika.canonical.regions import regions
-from uika.canonical.surface import canonical_binding, mirror_map
+from uika.canonical.surface import canonical_binding, face_map, mirror_map
 from uika.head import HeadModel, pose_gaussians, skin_points
 from uika.metrics.lpips import Lpips
 from uika.model import ESTIMATORS, Estimator, Reconstructor, SurfaceTexels, build
@@ -50,6 +50,7 @@ class GaussianNetwork(nn.Module):
         size = model.config.map_size
         self._binding = canonical_binding(head, model.config.canonical, size)
         self._mirror, self._regions = mirror_map(head, size), regions(head, self._binding)
+        self._face = face_map(head, self._binding)
 
     def forward(self, items: Sequence[Item]) -> list[tuple[Tensor, ...]]:
         """Means, quats, scales, opacities, colours, offsets, the completed observation and its share [M] of each."""
@@ -66,6 +67,7 @@ class GaussianNetwork(nn.Module):
             item.prior if len(item.prior) else None,
             item.lift,
             item.shape,
+            None if self._face is None else self._face.to(device),
         )
         photos = (item.images[None], item.masks[None], *self._located(item))
         views = self.model.encode(*photos)
