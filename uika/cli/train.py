@@ -50,7 +50,7 @@ class Train:
     """Copies of the network, or one cut up."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    learning_rate: Annotated[float | None, arg(metavar="NUM")] = None
+    learning_rate: Annotated[float | None, arg(metavar="N")] = None
     """The highest; else the preset's own."""
     images: Annotated[int | None, arg(metavar="INT")] = None
     """Photos per step and process."""

@@ -63,6 +63,8 @@ class GaussianDecoder(nn.Module):
         share = _gather(surface.face[None], texel)
         if self.scope == "unseen_colors":
             share = (1 - share) * (1 - _gather(known, texel).to(seen.dtype))
+            if surface.regions is not None:  # eyes and mouths are not completed from what is around them
+                share = share * (surface.regions.flatten()[texel] == 0)[None, :, None]
         return self._colors_alone(result, seen[..., :3], share, surface)
 
     def _colors_alone(self, result: Attributes, seen: Tensor, share: Tensor, surface: SurfaceTexels) -> Attributes:
