@@ -34,7 +34,7 @@ FACE_PULL = 0.1  # keeps vertices at the hairline near the skin
 EAR_BARE, EAR_COVERED = 0.005, 0.012  # metres of hair below which an ear shows as it is, above which not at all
 EAR_RINGS, EAR_ROUNDS = 3, 80
 FALLEN = 0.03  # metres below its roots from which hair follows its neighbours and not the outline, which it ends
-HANGING_LOSS = 0.015  # overlap of mattes and silhouettes that hair may lose by hanging and still be taken to hang
+HANGING_LOSS = 0.015  # overlap of one matte and silhouette that hair may lose by hanging and still be taken to hang
 TURN_POWER = 16  # of the cosine of a face's turn: half the trust at 17 degrees, a tenth at 30
 NORMAL_ROUNDS = 30  # of averaging, so that an ear moves out as one piece
 
@@ -102,11 +102,11 @@ def fit_hair(
     stands, hangs = torch.zeros_like(canonical), hanging_hair(head, bald, cameras, mattes)
     if not bool((hangs != 0).any()):
         return whole(stands, trust)
-    # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any outline.
-    # Every photo has a say in this.
+    # Hair that only stands off far misses more than that when it is let down; standing hair can imitate any outline,
+    # but hardly those of several photos at once. Every photo has a say in this.
     stood, fell = (whole(start, torch.ones_like(trust)) for start in (stands, hangs))
     standing, fallen = (overlap(head, bald + offset, cameras, mattes) for offset in (stood, fell))
-    down = fallen > standing - HANGING_LOSS
+    down = fallen > standing - HANGING_LOSS / len(bald) ** 2
     if len(bald) == 1:
         return fell if down else stood
     return whole(hangs if down else stands, trust)
