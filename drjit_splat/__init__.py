@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .prepared import Prepared, prepare
     from .profiling import profile
     from .rasterizer import rasterization
+    from .sog import load_sog
     from .splat import load_splat, save_splat
     from .spz import load_spz, save_spz
 
@@ -28,6 +29,7 @@ _HOMES = {
     "ProjectedFrame": "frames",
     "SplatFile": "ply",
     "load_ply": "ply",
+    "load_sog": "sog",
     "load_splat": "splat",
     "load_splats": "files",
     "load_spz": "spz",
@@ -50,6 +52,7 @@ __all__ = [
     "SplatFile",
     "__version__",
     "load_ply",
+    "load_sog",
     "load_splat",
     "load_splats",
     "load_spz",

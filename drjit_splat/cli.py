@@ -199,9 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"drjit-splat {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     render = commands.add_parser("render", help="render a splat file", description=_EXAMPLE)
-    render.add_argument(
-        "scene", help="a .ply (plain or compressed), .spz or .splat file with harmonics of degree 0 to 3"
-    )
+    render.add_argument("scene", help="a .ply (plain or compressed), .spz, .sog or .splat file")
     render.add_argument("-o", "--output", default="out.png", help="the picture to write (default: %(default)s)")
     render.add_argument("--camera", help=_CAMERA_HELP)
     render.add_argument("--index", type=int, default=0, help="which camera of a list (default: %(default)s)")

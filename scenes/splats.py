@@ -146,7 +146,7 @@ def _integrator_class(mi: Any) -> Any:
 def _load(path: str) -> tuple[dict[str, tuple[int, ...]], dict[str, Tensor]]:
     """Shapes and values of a file's splats."""
     kind = Path(path).suffix.lower()
-    if kind in (".ply", ".splat", ".spz"):
+    if kind in (".ply", ".sog", ".splat", ".spz"):
         from drjit_splat import load_splats
 
         values = dict(vars(load_splats(path)))

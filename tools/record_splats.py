@@ -1,17 +1,23 @@
-"""Write `.spz` and compressed `.ply` files of made-up splats by another library, gsply, for the tests.
+"""Write `.spz`, compressed `.ply` and `.sog` files of made-up splats, by and for another library, gsply, for the tests.
 
 It needs `pip install gsply zstandard` beside the project.
 """
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import gsply
 import numpy as np
+from gsply import sog_reader
+from PIL import Image
 
 from drjit_splat import SplatFile
 from tests.drjit_splat.test_compressed_ply import COUNT, DEGREE
+from tests.drjit_splat.test_sog import COUNT as SOG_COUNT
+from tests.drjit_splat.test_sog import bundle, write
 from tests.drjit_splat.test_spz import made_up
 
 FOLDER = Path(__file__).resolve().parent.parent / "tests" / "drjit_splat" / "recorded"
@@ -36,6 +42,19 @@ def main() -> None:
     gsply.plywrite(
         str(FOLDER / "gsply.compressed.ply"), data(made_up(COUNT, DEGREE), (1, 1, 1), (1, 1, 1, 1)), compressed=True
     )
+    record_sog()
+
+
+def record_sog() -> None:
+    """A bundle by our own writer of the tests, and what gsply reads from it."""
+    bundled = write(FOLDER / "made_up.sog", *bundle(made_up(SOG_COUNT, 2)))
+    # gsply decodes pictures with imagecodecs; pillow does the same.
+    sog_reader.imagecodecs = SimpleNamespace(
+        webp_decode=lambda data: np.asarray(Image.open(io.BytesIO(data)).convert("RGBA"))
+    )
+    found = sog_reader.sogread(str(bundled))
+    names = ("means", "scales", "quats", "opacities", "sh0", "shN")
+    np.savez_compressed(FOLDER / "gsply_sog.npz", **{name: getattr(found, name) for name in names})
 
 
 if __name__ == "__main__":

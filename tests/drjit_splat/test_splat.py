@@ -45,8 +45,8 @@ def test_unusable_files_are_named(tmp_path: Path) -> None:
     path.write_bytes(struct.pack("<2f", 1.0, float("nan")) + bytes(24))
     with pytest.raises(ValueError, match=r"bad\.splat: means\[0, 1\] is nan"):
         load_splat(path)
-    with pytest.raises(ValueError, match=r"a\.sog: splat files end in \.ply, \.splat, \.spz"):
-        load_splats(tmp_path / "a.sog")
+    with pytest.raises(ValueError, match=r"a\.ksplat: splat files end in \.ply, \.sog, \.splat, \.spz"):
+        load_splats(tmp_path / "a.ksplat")
     bad = torch.full((1, 3), torch.inf)
     with pytest.raises(ValueError, match="scales"):
         save_splat(path, torch.zeros(1, 3), torch.ones(1, 4), bad, torch.ones(1), torch.ones(1, 3))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import gzip
+import io
 import random
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drjit_splat import load_ply, load_spz, save_spz
+from drjit_splat import load_ply, load_sog, load_spz, save_spz
 from drjit_splat.training import open_capture
 from tests.drjit_splat.test_compressed_ply import RECORDED as COMPRESSED
 from tests.drjit_splat.test_spz import RECORDED, made_up
@@ -37,6 +39,26 @@ def _spz_damage(data: bytes, rng: random.Random) -> bytes:
 def _compressed(folder: Path) -> list[Path]:
     shutil.copy(COMPRESSED, folder / "a.ply")
     return [folder / "a.ply"]
+
+
+def _sog(folder: Path) -> list[Path]:
+    shutil.copy(RECORDED / "made_up.sog", folder / "a.sog")
+    return [folder / "a.sog"]
+
+
+def _sog_damage(data: bytes, rng: random.Random) -> bytes:
+    """Edit one member and put the archive right, or edit the archive."""
+    if rng.random() < 0.3:
+        return mutate.blind(data, rng)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = rng.choice(["meta.json", "meta.json", *members])
+    members[name] = (mutate.text if name == "meta.json" else mutate.blind)(members[name], rng)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for key, content in members.items():
+            archive.writestr(key, content)
+    return out.getvalue()
 
 
 def _colmap(binary: bool) -> Callable[[Path], list[Path]]:
@@ -82,6 +104,7 @@ def _read_transforms(path: Path) -> None:
 TARGETS: dict[str, tuple[Callable[[Path], list[Path]], mutate.Mutator, Callable[[Path], Any], type[Exception]]] = {
     "spz": (_spz, _spz_damage, load_spz, ValueError),
     "compressed_ply": (_compressed, mutate.ply, load_ply, ValueError),
+    "sog": (_sog, _sog_damage, load_sog, ValueError),
     "colmap_text": (_colmap(binary=False), mutate.text, _read_colmap, ValueError),
     "colmap_binary": (_colmap(binary=True), mutate.blind, _read_colmap, ValueError),
     "scene_transforms": (_transforms, mutate.text, _read_transforms, ValueError),
