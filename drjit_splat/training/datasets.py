@@ -27,30 +27,31 @@ def open_capture(path: str | Path, every: int = 8) -> Capture:
     if not place.exists():
         raise ValueError(f"{place}: no such data set")
     if place.is_file() or (place / "transforms.json").is_file():
-        return _split(read_transforms(place if place.is_file() else place / "transforms.json"), every)
+        return _split(read_transforms(place if place.is_file() else place / "transforms.json"), every, place)
     if (place / "transforms_train.json").is_file():
-        return _checked(read_blender(place))
+        return _checked(read_blender(place), place)
     if (tables := colmap_folder(place)) is not None:
-        return _split(read_colmap(place, tables), every)
+        return _split(read_colmap(place, tables), every, place)
     raise ValueError(
         f"{place}: holds neither transforms.json, transforms_train.json nor COLMAP tables (cameras, images, points3D)"
     )
 
 
-def _split(capture: Capture, every: int) -> Capture:
+def _split(capture: Capture, every: int, place: Path) -> Capture:
     photos = sorted(capture.photos, key=lambda photo: photo.path)
     held_out = tuple(photos[::every]) if len(photos) >= every else ()
     return _checked(
-        replace(capture, photos=tuple(p for i, p in enumerate(photos) if i % every or not held_out), held_out=held_out)
+        replace(capture, photos=tuple(p for i, p in enumerate(photos) if i % every or not held_out), held_out=held_out),
+        place,
     )
 
 
-def _checked(capture: Capture) -> Capture:
+def _checked(capture: Capture, place: Path) -> Capture:
     """The capture, if it has photos and their files are there."""
     if not capture.photos:
-        raise ValueError("the data set has no photos with poses")
+        raise ValueError(f"{place}: the data set has no photos with poses")
     missing = [photo.path for photo in (*capture.photos, *capture.held_out) if not is_there(photo.path)]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ValueError(f"{missing[0]}: the data set names this picture, which is not there{more}")
+        raise ValueError(f"{missing[0]}: the data set {place} names this picture, which is not there{more}")
     return capture
