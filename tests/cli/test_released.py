@@ -61,9 +61,7 @@ def test_the_command_gives_the_released_gaussians(folder: Path, avatar: Avatar) 
     assert avatar.provenance["model"] == "released (uika.safetensors)"
 
 
-def test_half_the_memory_gives_nearly_the_same(
-    folder: Path, avatar: Avatar, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bfloat16_gives_nearly_the_same(folder: Path, avatar: Avatar, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--model", str(folder / "uika.safetensors"), "--head", str(folder / "flame.npz")]
     given = [*words, "--precision", "bfloat16", "-o", str(folder / "half.safetensors")]
     assert main(["reconstruct", str(PORTRAIT), *given]) == 0

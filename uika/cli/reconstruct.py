@@ -33,7 +33,7 @@ class Reconstruct:
     correspondence: Literal["fit", "network", "both"] | None = None
     """What tells pixels their place: the fitted head, an estimator, or a fit that an estimator helps."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16 runs released weights in half the memory and less time, nearly the same."""
+    """bfloat16 runs released weights quicker where the processor has it, nearly the same."""
     refine: bool = True
     """Refine face shape and poses with the colours that two or more photos share."""
     keep: Literal["all", "foreground"] = "all"
