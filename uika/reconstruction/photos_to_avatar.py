@@ -69,8 +69,8 @@ def reconstruct(
         correspondence: what says what each pixel shows: "fit", the fitted head; "network", an estimator, the built-in
             one where no other is given; "both", the fitted head, in whose fit an estimator had a say. None stands for
             "network" where `estimator` is given, else for the default.
-        precision: of released weights; "bfloat16" takes a part of the time where the processor computes it, and a little
-            less memory, for nearly the same avatar.
+        precision: of released weights; "bfloat16" takes a part of the time where the processor computes it, and a
+            little less memory, for nearly the same avatar.
         refine: whether to refine the fit with the colours that two or more photos share.
         keep: "foreground" leaves out what shows nothing of the head, see `uika.model.Reconstructor.forward`.
         photo_splats: whether to add splats for what the photos show outside the fitted surface; a model whose Gaussians
