@@ -199,3 +199,13 @@ def test_a_wider_crop_adds_clothes_to_the_turned_torso() -> None:
     assert again.alpha[beyond].mean() > 0.9
     assert (again.rgb[beyond] - GREEN).abs().mean() < 0.08
     assert above_cut(whole.template, avatar.canonical_vertices(whole), result.means).min() > -1e-3
+
+
+def test_what_hangs_together_with_nothing_is_left_out(avatar: Avatar, head: HeadModel) -> None:
+    row = int(top(avatar, head)[1]) + 60
+    edge = int((photo(avatar, head, torch.zeros(SIZE, SIZE)).matte[row] > 0.5).nonzero()[0])
+    plain, joined, alone = (
+        len(with_photo_splats(avatar, head, [photo(avatar, head, extra)]))
+        for extra in (torch.zeros(SIZE, SIZE), disc(edge - 6, row, 14), disc(edge - 30, row, 14))
+    )
+    assert joined > plain + 100 and alone == plain

@@ -20,6 +20,7 @@ from uika.head.mesh_parts import tongue
 _HAIR_DEPTH = 0.012  # metres that hair stands off the scalp where it surely is hair
 _BARE = 0.1  # hairiness up to which the face counts as bare skin
 _SOURCE = 30.0  # pull of a fully seen vertex towards its own colour, relative to an edge
+_FALLEN = 0.03  # metres below its roots from which hair hangs
 _SKIN_PULL, _HAIR_PULL = 0.1, 0.5  # pull of every vertex towards the typical colour of its kind
 _SEEN = 0.8  # share of the observation from which a texel lends its strands
 
@@ -97,13 +98,14 @@ def texels_to_vertices(head: HeadModel, binding: Binding, color: Tensor, seen: T
 def _hairiness(head: HeadModel, static_offset: Tensor) -> Tensor:
     """How far each vertex [V] belongs to hair rather than skin, in [0,1]: the scalp and where hair stands off it.
 
-    Below the jaw joint it fades to skin, which is reached at the height of the neck joint.
+    Below the jaw joint it fades to skin, which is reached at the height of the neck joint, unless it hangs.
     """
     hair = (static_offset.norm(dim=-1) / _HAIR_DEPTH).clamp_max(1)
     if "scalp" in head.masks:
         hair = torch.maximum(hair, head.masks["scalp"] * (1 - head.masks.get("ears", 0.0)))
     neck, jaw = head.joints[1:3, 1]
-    return hair * ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1)
+    high = ((head.template[:, 1] - neck) / (jaw - neck)).clamp(0, 1)
+    return hair * torch.maximum(high, (-static_offset[:, 1] / _FALLEN).clamp(0, 1))
 
 
 def _continue(head: HeadModel, color: Tensor, seen: Tensor, kind: Tensor, draw: Tensor) -> Tensor:

@@ -66,6 +66,8 @@ class Reconstruct:
         print_seconds(result.report)
         if result.fit is not None and result.fit.gain:
             print(f"refined: {result.fit.gain}")
+        if result.report.agreement:
+            print("faces agree by", *(f"{value:.2f}" for value in result.report.agreement))
         print(f"wrote {target}: {len(result.avatar):,} Gaussians from {_photos(len(self.photos))}")
         return 0
 

@@ -61,7 +61,7 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
         clothes: whether the photo may tell what lies below the head.
         relit: whether the avatar's colours are not kept under this photo's own light.
     """
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, label
 
     shown = render(avatar, view.parameters, view.camera, head, depth=True)
     assert shown.depth is not None
@@ -93,6 +93,9 @@ def missing(avatar: Avatar, head: HeadModel, view: PhotoView, *, clothes: bool, 
     lacking = ((wanted - shown.alpha) / (1 - shown.alpha).clamp_min(1e-3)).clamp(0, 1)
     # What the matte adds at the face's own outline is background light or an error of the fit.
     outside = (shown.alpha < THIN) & (lacking > LEAST) & ~(skin[row, column] & (hair | solid))
+    # What hangs together with nothing would float when seen from the side.
+    parts = torch.from_numpy(label((outside | solid).numpy())[0])
+    outside &= torch.isin(parts, parts[solid].unique())
     rim = solid & (within <= RIM) & (wanted > 0.5) & ~skin & hair
     alpha = view.matte.clamp_min(0.05)
     color = ((view.image - (1 - alpha)) / alpha).clamp(0, 1)

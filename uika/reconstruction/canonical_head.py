@@ -18,6 +18,7 @@ from uika.canonical.light import (
 )
 from uika.canonical.surface import SurfaceTexels, surface_texels
 from uika.head import HeadModel
+from uika.reconstruction.agreement import FaceDrawing, best_agreements, face_drawings
 from uika.reconstruction.models import LoadedModel
 from uika.reconstruction.report import Report
 
@@ -66,6 +67,7 @@ class CanonicalHead:
         self._head, self._config = head, config
         self._loaded, self._levels = loaded, list[Tensor]()
         self._session = Session(loaded.network, self.binding.texel, self._surface, keep, prior, growing=growing)
+        self._growing, self._faces = growing, list[FaceDrawing]()
         self._run, self._on_template = loaded.run, loaded.on_template
         self._lit: LightSample | None = None
         self.light: Tensor | None = None  # [9,3] that the colours are kept under
@@ -87,6 +89,9 @@ class CanonicalHead:
 
         with report.stage("correspondence"):
             uv, weight = self._located(fit, images, mattes)
+            if self._growing or len(images) > 1:
+                self._faces += face_drawings(self._head, images, uv[0], weight)
+                report.agreement[:] = best_agreements(self._faces) if len(self._faces) > 1 else []
         if fit is not None and not self._on_template:
             with report.stage("light"):
                 images = self._under_one_light(fit, images, uv[0], weight[:, None])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
+from uika.reconstruction.agreement import warn_of_strangers
 from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import FittedPhotos, PreparedPhoto, fit_prepared, prepare_files
@@ -113,4 +114,5 @@ class GrowingAvatar:
             avatar = with_outside(avatar, head, groups, report, poses)
         self._photos = [*self._photos, *new] if before else list(new)
         self._first, self._groups = (fit, canonical), groups
+        warn_of_strangers(photos, report.agreement)
         return with_doubts(avatar, photos)

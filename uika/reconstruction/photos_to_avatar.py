@@ -15,6 +15,7 @@ from uika.avatar import Avatar
 from uika.errors import UikaError
 from uika.head import HeadModel, load_head
 from uika.photo_splats import PhotoView
+from uika.reconstruction.agreement import warn_of_strangers
 from uika.reconstruction.bust import with_bust
 from uika.reconstruction.canonical_head import CanonicalHead
 from uika.reconstruction.fitted_photos import fit_files
@@ -98,6 +99,7 @@ def reconstruct(
         observed = observed._replace(fit=replace(observed.fit, parameters=poses))
     if photo_splats and not loaded.on_template:
         avatar = with_outside(avatar, head if bust else alone, [observed], report)
+    warn_of_strangers(observed.photos, report.agreement)
     return Reconstruction(with_doubts(avatar, observed.photos), observed.photos, observed.fit, report)
 
 
