@@ -198,6 +198,12 @@ def _matte(crop: NDArray[np.uint8], landmarks: NDArray[np.float64], inside: NDAr
     oval = landmarks[list(OVAL)]
     sure = polygon(oval.mean(axis=0) + 0.85 * (oval - oval.mean(axis=0)), size)
     rough = person_mask(crop)
+    beyond = inside < 0.5
+    if beyond.any() and not beyond.all():
+        # Repeated edges make stripes that may look like people: beside the head, a plain surrounding has a say too.
+        plain = np.where(beyond[..., None], crop[~beyond].mean(axis=0).astype(np.uint8), crop)
+        beside = face_frame(landmarks, pixel_centres(size))[1] > 0
+        rough = np.where(beside, np.minimum(rough, person_mask(plain)), rough)
     step = round(EDGE_STEP * size)
     for axis in (0, 1):
         seen = np.flatnonzero(inside.max(axis=1 - axis) > 0)
