@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from uika.canonical.hair_color import grain, kinds, like_first, strands, weighted_median
+from uika.canonical.hair_color import grain, kinds, like_first, nearby, strands, weighted_median
 from uika.canonical.regions import at_texels, mask_at_texels
 from uika.head import Binding, HeadModel, load_head, uv_texels
 
@@ -70,3 +70,13 @@ def test_medians_weigh() -> None:
     values = torch.linspace(0, 1, 101)[:, None].expand(101, 3)
     assert abs(float(weighted_median(values, torch.ones(101))[0]) - 0.5) < 0.02
     assert float(weighted_median(values, 1 + 9 * (values[:, 0] > 0.8))[0]) > 0.75
+
+
+def test_a_veil_goes_on_beside_what_was_seen_of_it() -> None:
+    points = ball(3000)
+    veil = torch.tensor([0.7, 0.65, 0.5])
+    seen = ((points[:, 0] > 0.05) & (points[:, 2] > 0)).float()
+    found = nearby(points, veil.expand(3000, 3), seen, HAIR)
+    beside = (points[:, 0].abs() > 0.07) & (points[:, 2] < 0) & (points[:, 2] > -0.02)
+    assert (found[beside] - veil).abs().max() < 0.1  # on the other side of the head too
+    assert (found[points[:, 2] < -0.095] - HAIR).abs().max() < 0.1

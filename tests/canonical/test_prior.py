@@ -34,7 +34,9 @@ def test_ears_that_hair_does_not_cover_are_skin_all_round() -> None:
     color = torch.where((scalp > 0.5)[:, None], hair, skin)
     known = (points[:, 2] > 0.0).float()
     maps = binding.to_map(color), binding.to_map(known[:, None])[0]
-    for lift, wanted in ((0.0, skin), (0.03, hair)):
-        offset = lift * torch.nn.functional.normalize(head.template, dim=-1)
+    # Hair over an ear blends into the cheek before it.
+    for lift, wanted, apart in ((0.0, skin, 0.12), (0.03, hair, 0.2)):
+        grown = torch.maximum(head.masks["scalp"], head.masks["ears"])[:, None]
+        offset = lift * grown * torch.nn.functional.normalize(head.template, dim=-1)
         supposed = binding.from_map(prior_colors(head, binding, offset, *maps, brightness=1.0))
-        assert (supposed[ears > 0.95].median(0).values - wanted).abs().max() < 0.15
+        assert (supposed[ears > 0.95].median(0).values - wanted).abs().max() < apart

@@ -18,6 +18,7 @@ ALIKE = 0.1  # sRGB distance up to which a colour is like another
 LEAST_SHARE = 0.1  # of the seen scalp that must be hair; less is a shadow on a bald head
 BINS = 64
 TEMPLES, CROWN, LOW_TRUST = 0.03, 0.09, 0.2  # metres between which hair gains trust: low, ears and neck are about
+AROUND, ENOUGH = 0.03, 4.0  # metres over which seen hair tells of its surroundings; vertices that outweigh the typical
 WHORL = (0.0, 0.82, -0.57)  # direction from the skull's middle to where hair grows from
 MIDDLE = (0.0, 0.03, -0.045)  # metres, of the skull
 STRANDS = (0.012, 0.006, 0.003)  # metres, widths of locks and strands
@@ -68,6 +69,25 @@ def like_first(color: Tensor, first: Tensor, second: Tensor) -> Tensor:
     share = other / (one + other).clamp_min(1e-6)
     alike = ((share - 0.5) / 0.2).clamp(0, 1) * ((first - second).norm() / APART).clamp(0, 1)
     return alike * (2 - one / ALIKE).clamp(0, 1)
+
+
+def nearby(points: Tensor, color: Tensor, seen: Tensor, typical: Tensor) -> Tensor:
+    """Colours [V,3] seen around vertices [V,3] on either side of the head, the typical one [3] far from all of them.
+
+    A veil or a hat's brim goes on beside what was seen of it, whatever the hair is like.
+
+    Args:
+        points: of the mean head, metres.
+        color: [V,3] observed.
+        seen: [V] how well, in [0,1].
+        typical: of hair.
+    """
+    shown = seen > SEEN
+    mirror = points.new_tensor([-1.0, 1.0, 1.0])
+    apart = [torch.cdist(points, side * points[shown]) for side in (torch.ones_like(mirror), mirror)]
+    weight = torch.stack([torch.exp(-0.5 * (each / AROUND).square()) for each in apart]).sum(0) * seen[shown]
+    total = weight.sum(1, keepdim=True)
+    return (weight @ color[shown] + ENOUGH * typical) / (total + ENOUGH)
 
 
 def texel_areas(head: HeadModel, binding: Binding) -> Tensor:

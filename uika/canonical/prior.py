@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from uika.canonical.eyes import complete_eyes
-from uika.canonical.hair_color import grain, kinds, like_first, weighted_median
+from uika.canonical.hair_color import grain, kinds, like_first, nearby, weighted_median
 from uika.canonical.mouth import hidden_mouth
 from uika.canonical.regions import EYEBALLS, MOUTH, TEETH, at_texels, mask_at_texels, regions
 from uika.canonical.tint import tone
@@ -58,7 +58,8 @@ def prior_colors(
     at_vertices, share = texels_to_vertices(head, binding, observed, seen)
     # Skin between strands and at the hairline lends nothing to hair that no photo shows.
     share = share * (1 - hair * like_first(at_vertices, skin, strand))
-    kind = torch.lerp(skin, strand, hair[:, None])
+    near = nearby(head.template, at_vertices, share * (hair > 0.5), strand)
+    kind = torch.lerp(skin.expand_as(near), near, hair[:, None])
     if bool((ears > 0.5).any()):
         on_ear = at_texels(head, binding, ears[:, None])[:, 0] * everywhere * (like_first(observed, skin, strand) > 0.5)
         kind = torch.lerp(kind, weighted_median(observed, on_ear, skin), ears[:, None])

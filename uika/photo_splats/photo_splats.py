@@ -245,9 +245,11 @@ def _made(
     points = unprojected(view, depth)[row, column]
     hair = own.hair[row, column]
     opacity = carved(points, dense[cell], hair, others)
-    skin = own.vertices[: len(head.masks["face"])][head.masks["face"] > 0.5]
-    near = torch.from_numpy(cKDTree(skin.numpy()).query(points.numpy(), distance_upper_bound=CLEAR)[0])
-    keep = (opacity > LEAST_OPACITY) & (hair | near.isinf())
+    keep = opacity > LEAST_OPACITY
+    if head.bust is not None:
+        skin = own.vertices[head.masks["face"] > 0.5]
+        near = torch.from_numpy(cKDTree(skin.numpy()).query(points.numpy(), distance_upper_bound=CLEAR)[0])
+        keep &= hair | near.isinf()
     row, column, points, hair = row[keep], column[keep], points[keep], hair[keep]
     middle = own.vertices[head.faces].mean(1)
     triangle = torch.empty(len(points), dtype=torch.int64)
