@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scene_validation import flame_head
 from scenes.validation.__main__ import main, validate
 from scenes.validation.gradients import GradientReport
 from scenes.validation.report import write_report
@@ -55,3 +56,10 @@ def test_normals_of_a_tilted_plane() -> None:
 def test_the_command_writes_a_report(tmp_path: Path) -> None:
     assert main(["-o", str(tmp_path / "report"), "--quick"]) == 0
     assert len(list((tmp_path / "report").glob("*.png"))) == 12
+
+
+@pytest.mark.slow
+def test_a_bust_glued_to_a_flame_head_agrees_with_mitsuba(tmp_path: Path) -> None:
+    reports, _, _ = validate(flame_head(tmp_path), 1, ((20.0, 5.0), (-80.0, -10.0)))
+    assert [report.bust for report in reports] == [True, True]
+    assert [report.failures() for report in reports] == [[], []]
