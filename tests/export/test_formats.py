@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from drjit_splat import load_ply, load_spz, rasterization
-from tests.avatars import painted_avatar
+from tests.avatars import painted_avatar, painted_bust
 from tests.heads import sphere_head
-from uika import Avatar, HeadModel, UikaError, get_motion, neutral_camera, render
+from uika import Avatar, HeadModel, UikaError, get_motion, load_head, neutral_camera, render
 from uika.export import (
     Splats,
     glb_provenance,
@@ -231,3 +231,16 @@ def test_thinned_avatar_still_covers_the_head(avatar, head):
     assert (alphas[0] - alphas[1]).abs().mean() < 0.02
     with pytest.raises(UikaError, match="count"):
         thinned(avatar, 0)
+
+
+def test_a_bust_glued_to_flame_is_left_out_of_what_flame_moves(tmp_path: Path) -> None:
+    whole = dataclasses.replace(load_head(), id="flame-test-bust")
+    assert whole.bust is not None
+    whole = dataclasses.replace(whole, bust=dataclasses.replace(whole.bust, head_id="flame-test"))
+    avatar = dataclasses.replace(painted_bust(load_head()), head_id=whole.id)
+    beside = write_bound_ply(tmp_path / "bound.ply", avatar, whole)
+    assert beside is not None
+    with np.load(beside) as arrays:
+        assert arrays["static_offset"].shape == (1, whole.bust.vertex, 3)
+    text = (tmp_path / "bound.ply").read_bytes()[:400].decode("ascii", "replace")
+    assert f"element vertex {int((~avatar.on_bust).sum())}" in text

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,7 +81,7 @@ def write_bound_ply(path: str | Path, avatar: Avatar, head: HeadModel) -> Path |
 
     Returns:
         The file `flame_param.npz` that was written beside it with the identity at rest, if the head is a FLAME head;
-        None for another head, which GaussianAvatars itself cannot move.
+        None for another head, which GaussianAvatars itself cannot move. FLAME ends at the neck: a bust is left out.
 
     Raises:
         UikaError: wrong extension, or nothing can be written there.
@@ -88,6 +90,9 @@ def write_bound_ply(path: str | Path, avatar: Avatar, head: HeadModel) -> Path |
 
     target = check_output(path, ".ply")
     target.parent.mkdir(parents=True, exist_ok=True)
+    flame = head.id.startswith("flame-")
+    if flame and head.bust is not None and len(avatar.static_offset) == len(head.template):
+        avatar, head = _without_bust(avatar, head), head.without_bust
     centre, rotation, size = triangle_frames(avatar.canonical_vertices(head), head.faces)
     turn, length = rotation[avatar.triangle], size[avatar.triangle][:, None]
     local = (turn.mT @ (avatar.means - centre[avatar.triangle])[..., None])[..., 0] / length
@@ -101,7 +106,17 @@ def write_bound_ply(path: str | Path, avatar: Avatar, head: HeadModel) -> Path |
         extra={"binding_0": avatar.triangle.float()},
         comments=[f"{key}: {value}" for key, value in avatar.provenance.items()],
     )
-    return _write_flame(target, avatar, head) if head.id.startswith("flame-") else None
+    return _write_flame(target, avatar, head) if flame else None
+
+
+def _without_bust(avatar: Avatar, head: HeadModel) -> Avatar:
+    """The avatar of the head alone: other programs' FLAME ends at the neck."""
+    assert head.bust is not None
+    kept = avatar.triangle < head.bust.face
+    names = ("means", "quats", "scales", "opacities", "colors", "triangle", "barycentric")
+    parts: dict[str, Any] = {name: getattr(avatar, name)[kept] for name in names}
+    offset = avatar.static_offset[: head.bust.vertex]
+    return replace(avatar, head_id=head.bust.head_id, static_offset=offset, bust_triangle=None, **parts)
 
 
 def triangle_frames(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
