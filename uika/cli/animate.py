@@ -31,25 +31,25 @@ class Animate:
     """The avatar file."""
     motion: str = "talk"
     """orbit, talk, expressions, or a motion file."""
-    video: Path | None = None
+    video: Annotated[Path | None, arg(metavar="PATH")] = None
     """A video to be driven by instead."""
-    speech: str | None = None
+    speech: Annotated[str | None, arg(metavar="STR")] = None
     """A text to speak, or a recording."""
-    transcript: Path | None = None
+    transcript: Annotated[Path | None, arg(metavar="PATH")] = None
     """The recording's words in a text file."""
-    language: str | None = None
+    language: Annotated[str | None, arg(metavar="STR")] = None
     """Of the text, such as de; else guessed."""
-    motion_head: Path | None = None
+    motion_head: Annotated[Path | None, arg(metavar="PATH")] = None
     """The head of FLAME parameters."""
-    save_motion: Path | None = None
+    save_motion: Annotated[Path | None, arg(metavar="PATH")] = None
     """Write the motion to a file, too."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("out.mp4")
     """The video to write."""
     size: int = 512
     """Side of the picture in pixels, even."""
-    light: str | None = None
+    light: Annotated[str | None, arg(metavar="STR")] = None
     """studio, or surroundings (.hdr) to be lit by."""
-    light_from: Path | None = None
+    light_from: Annotated[Path | None, arg(metavar="PATH")] = None
     """A photo of a face to be lit like."""
     fps: float | None = None
     """Else 25, or the motion's own."""

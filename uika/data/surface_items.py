@@ -150,7 +150,7 @@ def person_items(head: HeadModel, person: int, settings: ItemSettings) -> Iterat
     recording = Recording(settings.views, max(settings.moments) + 1, _SOURCE)
     first = min(settings.moments)
     shared, moments = record_identity(head, settings.seed, person, recording, start=first)
-    with np.load(io.BytesIO(shared["canonical"])) as canonical:
+    with np.load(io.BytesIO(shared["canonical"]), allow_pickle=False) as canonical:
         lift = torch.from_numpy(canonical["static_offset"][0]).norm(dim=-1)
     for moment, recorded in enumerate(moments, start=first):
         if moment not in settings.moments:
