@@ -85,7 +85,7 @@ def test_the_splatting_alone_passes_its_tests(installed: Installed) -> None:
     listed = installed.run("python", "-m", "pip", "list", "--format", "freeze", "--disable-pip-version-check").lower()
     names = {line.partition("==")[0] for line in listed.splitlines()}
     assert names >= {"drjit-splat", "torch", "pillow"} and not names & {"uika-drjit", "mitsuba", "viser", "scipy"}
-    tests = ("pytest", "hypothesis", "scipy")  # what the tests themselves need
+    tests = ("pytest", "hypothesis", "scipy", "zstandard")  # what the tests themselves need
     installed.run("python", "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *tests)
     # The examples' portrait is uika's, and the page needs a browser.
     own = shutil.ignore_patterns("test_examples.py", "test_page.py", "__pycache__")
