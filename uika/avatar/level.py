@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ def halved(avatar: Avatar) -> Avatar:
     }
     merged["opacities"] = (total / (merged["scales"][:, 1] * merged["scales"][:, 2])).clamp(max=_MOST)
     order = torch.cat((first, alone.nonzero()[:, 0])).argsort()
-    fields = {
+    fields: dict[str, Any] = {
         name: torch.cat((value.to(getattr(avatar, name).dtype), getattr(avatar, name)[alone]))[order]
         for name, value in merged.items()
     }
