@@ -26,8 +26,8 @@ def seen(head: HeadModel, yaw: float, seed: int) -> tuple[torch.Tensor, SurfaceM
     camera = look_at(yaw, 5.0, 1.1, fov_y=20.0, size=SIZE)
     marks = torch.full((1, 478, 2), SIZE / 2)
     marks[0, head.landmark_ids] = project(head.landmarks(vertices), camera)[0]
-    triangle, barycentric, _ = surface_points(head, 300)
-    points = SurfaceMarks(triangle, barycentric, torch.zeros(1, 300, 2), torch.zeros(1, 300))
+    triangle, barycentric, _ = surface_points(head, 200)
+    points = SurfaceMarks(triangle, barycentric, torch.zeros(1, 200, 2), torch.zeros(1, 200))
     place, _ = project(points.on(head, vertices), camera)
     normal = torch.nn.functional.normalize(points.on(head, vertex_normals(vertices, head.faces)), dim=-1)
     ray = torch.nn.functional.normalize(camera.position - points.on(head, vertices), dim=-1)
@@ -70,17 +70,17 @@ def test_points_are_found_in_an_exact_map(head: HeadModel) -> None:
     view = View(PaintedPerson(1).sample(0), 256)
     assert view.parameters is not None
     uv = tracked_uv(view, head)
-    triangle, barycentric, places = surface_points(head, 300)
+    triangle, barycentric, places = surface_points(head, 200)
     found, weight = find_points(places, uv.nan_to_num(), torch.isfinite(uv[0]).float())
     points = SurfaceMarks(triangle, barycentric, found[None], weight[None])
     truth, _ = project(points.on(head, pose_vertices(head, view.parameters)), view.camera)
     at = weight > 0
-    assert int(at.sum()) > 60
+    assert int(at.sum()) > 40
     assert float((found - truth)[at].norm(dim=-1).median()) < 0.5  # pixels of 256
     assert float((found - truth)[at].norm(dim=-1).quantile(0.95)) < 2.0
 
 
 def test_nothing_is_found_where_nothing_is_trusted(head: HeadModel) -> None:
-    _, _, places = surface_points(head, 300)
+    _, _, places = surface_points(head, 200)
     found, weight = find_points(places, torch.rand(2, 64, 64), torch.zeros(64, 64))
     assert not weight.any() and torch.isfinite(found).all()

@@ -15,11 +15,13 @@ from uika.head import HeadModel, uv_texels
 if TYPE_CHECKING:
     from uika.model.surface_estimator import SurfaceEstimator
 
-POINTS = 300
+POINTS = 200
 SIDE = 256  # pixels of the pictures in which they are looked for
 _ATLAS = 192  # texels in which the points are chosen
 _BORDER = 6  # texels from a seam, beyond which one side of a point's surroundings cannot be found
-_HIDDEN = ("eyeballs", "mouth_inner", "teeth")
+# The neck turns with joints that a fit to photos leaves at rest.
+_LEFT_OUT = ("eyeballs", "mouth_inner", "teeth", "neck")
+_BLIND = 0.012  # metres from the nearest landmark on the mean head, beyond which landmarks know little
 _NEAR = 0.02  # of the atlas: pixels farther from a point's place do not tell where it is
 _PIXELS = 16  # nearest ones that tell
 _LEAST = 6.0  # sum of their weights from which the point counts as seen
@@ -88,13 +90,18 @@ def find_points(points: Tensor, uv: Tensor, trust: Tensor) -> tuple[Tensor, Tens
 
 @lru_cache(maxsize=4)
 def surface_points(head: HeadModel, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Triangles [D], barycentrics [D,3] and atlas places [D,2] of points spread evenly over skin and scalp."""
+    """Triangles [D], barycentrics [D,3] and atlas places [D,2] of points spread evenly where landmarks are blind."""
     binding = uv_texels(head, _ATLAS)
     inner = -functional.max_pool2d(-binding.valid[None, None].float(), 2 * _BORDER + 1, 1, _BORDER)[0, 0]
-    hidden = torch.stack([head.masks[name] for name in _HIDDEN if name in head.masks] or [torch.zeros(0)]).amax(0)
-    shown = (hidden[head.faces] if len(hidden) else torch.zeros(head.faces.shape)).amax(-1)[binding.triangle] < 0.5
-    chosen = (shown & (inner.flatten()[binding.texel] > 0)).nonzero()[:, 0]
-    points = (head.template[head.faces[binding.triangle[chosen]]] * binding.barycentric[chosen][..., None]).sum(1)
+    corners = head.faces[binding.triangle]
+    points = (head.template[corners] * binding.barycentric[..., None]).sum(1)
+    usable = inner.flatten()[binding.texel] > 0
+    usable &= torch.cdist(points, head.landmarks(head.template)).amin(1) > _BLIND
+    for name in _LEFT_OUT:
+        if name in head.masks:
+            usable &= head.masks[name][corners].amax(-1) < 0.5
+    chosen = usable.nonzero()[:, 0]
+    points = points[chosen]
     taken = [int(points[:, 2].argmax())]
     away = (points - points[taken[0]]).norm(dim=-1)
     for _ in range(min(count, len(chosen)) - 1):
