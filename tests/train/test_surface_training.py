@@ -41,8 +41,8 @@ def test_training_lowers_its_loss_and_resumes_to_the_same_weights(items: Path, t
     train_surface(tmp_path / "cut", items, load_head(), replace(SHORT, steps=6, cooldown=0.01), say=lambda _: None)
     with pytest.raises(UikaError, match="--resume"):
         train_surface(tmp_path / "cut", items, load_head(), SHORT)
-    with pytest.raises(UikaError, match="was trained with cooldown"):
-        train_surface(tmp_path / "cut", items, load_head(), SHORT, resume=True)
+    with pytest.raises(UikaError, match="was trained with batch"):
+        train_surface(tmp_path / "cut", items, load_head(), replace(SHORT, batch=3), resume=True)
     plan = replace(SHORT, steps=12, cooldown=0.01)
     train_surface(tmp_path / "cut", items, load_head(), plan, resume=True, say=lambda _: None)
     train_surface(tmp_path / "uncut", items, load_head(), plan, say=lambda _: None)

@@ -26,6 +26,7 @@ _NEAR = 0.02  # of the atlas: pixels farther from a point's place do not tell wh
 _PIXELS = 16  # nearest ones that tell
 _LEAST = 6.0  # sum of their weights from which the point counts as seen
 _PERSON = 0.7  # matte
+_TRUSTED = 0.25  # confidence
 _SPREAD_PIXELS = 6.0  # pixels of SIDE: a point whose surroundings lie farther apart is torn between two places
 
 
@@ -62,12 +63,12 @@ def find_points(points: Tensor, uv: Tensor, trust: Tensor) -> tuple[Tensor, Tens
     Args:
         points: [D,2] places, v down.
         uv: [2,H,W] what the pixels show.
-        trust: [H,W] in [0,1]; pixels below one half are left out.
+        trust: [H,W] in [0,1]; pixels below a quarter are left out.
 
     Returns:
         The pixels, and the trust [D] in each, 0 where it is not seen.
     """
-    rows, columns = (trust > 0.5).nonzero(as_tuple=True)
+    rows, columns = (trust > _TRUSTED).nonzero(as_tuple=True)
     if len(rows) < _PIXELS:
         return torch.zeros(len(points), 2), torch.zeros(len(points))
     pixels = torch.stack((columns, rows), -1) + 0.5

@@ -12,11 +12,11 @@ from torch.nn import functional
 from uika.data.surface_items import CODE_STEP, SurfaceItem
 from uika.train.augment import degrade
 
-_TURN, _WILD_TURN, _WILD = 14.0, 45.0, 0.12  # degrees of a crop's turn, of the odd one, and how often that is
-_SIDE, _SHIFT = (0.85, 1.4), 0.1  # side of the crop over that of the item, and its shift
+_TURN, _WILD_TURN, _WILD = 10.0, 40.0, 0.03  # degrees of a crop's turn, of the odd one, and how often that is
+_SIDE, _SHIFT = (0.95, 1.4), 0.06  # side of the crop over that of the item, and its shift
 _MIRROR = 0.5
-_BODY, _FOUND, _PLAIN, _WHITE = 0.75, 0.8, 0.92, 0.75
-_COLOURLESS, _SHADE, _STREAK = 0.15, 0.6, 0.5
+_BODY, _FOUND, _PLAIN, _WHITE = 0.75, 0.8, 0.97, 0.92
+_COLOURLESS, _SHADE, _STREAK = 0.1, 0.5, 0.5
 _SMOOTH = 24  # cells of noise
 
 
@@ -149,7 +149,7 @@ def _errors(found: Tensor, exact: Tensor, random: np.random.Generator) -> Tensor
         field = _noise(size, (5, 5), 1, random)[0]
         soft = functional.avg_pool2d(matte[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
         matte = ((soft - 0.5 + 0.25 * field) * random.uniform(2, 6) + 0.5).clamp(0, 1)
-    if random.random() < 0.15:
+    if random.random() < 0.1:
         blob = (_noise(size, (6, 6), 1, random)[0] - random.uniform(1.0, 1.8)).mul(8).clamp(0, 1)
         matte = torch.maximum(matte, blob) if random.random() < 0.6 else matte * (1 - blob)
     return matte
@@ -159,7 +159,7 @@ def _occluded(image: Tensor, random: np.random.Generator) -> tuple[Tensor, Tenso
     """The picture with a hand, a microphone, a hat's brim before it at times, and where that is [S,S]."""
     size = image.shape[-1]
     hidden = torch.zeros(size, size)
-    while random.random() < 0.3:
+    while random.random() < 0.12:
         place = (torch.arange(size) + 0.5) / size
         y, x = torch.meshgrid(place, place, indexing="ij")
         cx, cy = random.uniform(0.1, 0.9, 2)
@@ -181,8 +181,8 @@ def _streaked(image: Tensor, hair: Tensor, random: np.random.Generator) -> Tenso
     lines = _noise(size, cells if random.random() < 0.6 else cells[::-1], 1, random)
     if random.random() < 0.5:
         lines = _sampled(lines, _crop(random), size, "bilinear")
-    tint = torch.from_numpy(random.normal(0, 0.06, (3, 1, 1))).float()
-    strong = random.uniform(0.1, 0.45)
+    tint = torch.from_numpy(random.normal(0, 0.04, (3, 1, 1))).float()
+    strong = random.uniform(0.05, 0.3)
     return torch.lerp(image, (image * (1 + strong * lines) + 0.05 * strong * lines + tint).clamp(0, 1), hair)
 
 
@@ -191,12 +191,12 @@ def _lit(image: Tensor, random: np.random.Generator) -> Tensor:
     size = image.shape[-1]
     if random.random() < _SHADE:
         cells = (int(random.integers(2, 5)), int(random.integers(2, 5)))
-        image = image * (random.uniform(0.1, 0.4) * _noise(size, cells, 1, random)).exp()
-    gains = np.exp(random.normal(-0.08, 0.16) + random.normal(0, 0.1, 3))
-    image = (image.clamp(0, 1) ** float(np.exp(random.normal(0, 0.25)))) * torch.from_numpy(gains).float()[
+        image = image * (random.uniform(0.05, 0.3) * _noise(size, cells, 1, random)).exp()
+    gains = np.exp(random.normal(-0.06, 0.12) + random.normal(0, 0.05, 3))
+    image = (image.clamp(0, 1) ** float(np.exp(random.normal(0, 0.18)))) * torch.from_numpy(gains).float()[
         :, None, None
     ]
-    image = ((image - 0.5) * float(np.exp(random.normal(0, 0.2))) + 0.5).clamp(0, 1)
+    image = ((image - 0.5) * float(np.exp(random.normal(0, 0.15))) + 0.5).clamp(0, 1)
     grey = image.mean(0, keepdim=True).expand(3, -1, -1)
     share = 1.0 if random.random() < _COLOURLESS else random.uniform(-0.3, 0.5)
     return torch.lerp(image, grey, share).clamp(0, 1)

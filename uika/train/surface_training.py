@@ -28,7 +28,7 @@ from uika.train.surface_augment import SurfaceBatch, make_batch, mirrored
 from uika.train.surface_losses import surface_figures, surface_losses
 
 MODEL_FILE, CHECKPOINT, LOG = "model.safetensors", "checkpoint.safetensors", "log.jsonl"
-_FREE = ("steps", "people", "save_every")  # may change when a run goes on
+_FREE = ("steps", "people", "save_every", "cooldown")  # may change when a run goes on
 
 
 @dataclass(frozen=True)
