@@ -6,6 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from uika.assets import CORRESPONDENCE_WEIGHTS
 from uika.head import load_head
 from uika.model import CheckpointError, Estimator
 from uika.model.config import SurfaceEstimatorConfig
@@ -77,3 +78,9 @@ def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     save_file(tensors, path, header)
     with pytest.raises(CheckpointError, match="cannot be read as an estimator"):
         read_estimator(path)
+
+
+def test_the_built_in_one_is_small_and_of_the_built_in_head() -> None:
+    assert CORRESPONDENCE_WEIGHTS.stat().st_size <= 8_000_000
+    check_estimator_head(CORRESPONDENCE_WEIGHTS, load_head())
+    assert isinstance(read_estimator(CORRESPONDENCE_WEIGHTS), SurfaceEstimator)

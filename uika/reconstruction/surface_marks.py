@@ -26,7 +26,7 @@ _NEAR = 0.02  # of the atlas: pixels farther from a point's place do not tell wh
 _PIXELS = 16  # nearest ones that tell
 _LEAST = 6.0  # sum of their weights from which the point counts as seen
 _PERSON = 0.7  # matte
-_TRUSTED = 0.25  # confidence
+_TRUSTED = 0.08  # confidence, which the built-in estimator keeps low
 _SPREAD_PIXELS = 6.0  # pixels of SIDE: a point whose surroundings lie farther apart is torn between two places
 
 
@@ -63,7 +63,7 @@ def find_points(points: Tensor, uv: Tensor, trust: Tensor) -> tuple[Tensor, Tens
     Args:
         points: [D,2] places, v down.
         uv: [2,H,W] what the pixels show.
-        trust: [H,W] in [0,1]; pixels below a quarter are left out.
+        trust: [H,W] in [0,1]; pixels of next to none are left out.
 
     Returns:
         The pixels, and the trust [D] in each, 0 where it is not seen.
