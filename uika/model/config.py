@@ -133,8 +133,8 @@ class ModelConfig:
                       network that is trained on mean errors paints smooth; not in the paper
     fusion            "learned" weight per Gaussian, or ablation "fixed": 0.5 times the confidence
     scope             what predictions count for: "all"; "face_colors", the colours of the face alone; or
-                      "unseen_colors", those of skin and hair off the face, away from what photos show. All else stays
-                      the surface with its completed observation, as without a network
+                      "unseen_colors", with half their weight, those of skin and hair off the face that no photo shows.
+                      All else stays the surface with its completed observation, as without a network
     canonical         surface that Gaussians start on and are moved with: "personal", the head with the person's
                       identity and hair, or "template", the mean head, as in the paper, where offsets hold the identity
     """

@@ -14,7 +14,9 @@ from uika.model.dpt import UvDpt, resize
 _LIFT_UNIT, _SHAPE_UNIT = 10.0, 30.0  # channel values of a metre of hair, of a metre off the mean head
 _COARSE = 52  # what is wider than this part of the atlas is no fine relief
 _SEEN = 0.1  # share of the observation from which a texel counts as seen
-_MARGIN = 0.0105  # of the atlas around what is seen, where photos show a little of the splats too
+_PREDICTED = (
+    0.5  # share of predictions in unseen colours: their mean with the completed observation errs less than either
+)
 _TEXELS = 8192  # at once: few enough to stay in the processor's cache, changes no value
 
 
@@ -64,7 +66,8 @@ class GaussianDecoder(nn.Module):
         assert surface.face is not None
         share = _gather(surface.face[None], texel)
         if self.scope == "unseen_colors":
-            share = (1 - share) * _gather(_unseen(known), texel).to(seen.dtype)
+            unseen = (1 - _gather(known, texel).to(seen.dtype) / _SEEN).clamp_min(0)
+            share = _PREDICTED * (1 - share) * unseen
             if surface.regions is not None:  # eyes and mouths are not completed from what is around them
                 share = share * (surface.regions.flatten()[texel] == 0)[None, :, None]
         return self._colors_alone(result, seen[..., :3], share, surface)
@@ -100,12 +103,6 @@ def _box_sums(maps: Tensor, reach: int, axis: int) -> Tensor:
     running = functional.pad(maps, (0, 0) * (-1 - axis) + (reach + 1, reach)).cumsum(axis)
     size = maps.shape[axis]
     return running.narrow(axis, 2 * reach + 1, size) - running.narrow(axis, 0, size)
-
-
-def _unseen(known: Tensor) -> Tensor:
-    """How far texels lie away from what photos show: 0 up to the margin around it, [B,1,S,S] in [0,1]."""
-    reach = round(_MARGIN * known.shape[-1])
-    return -functional.max_pool2d((known / _SEEN - 1).clamp_max(0), 2 * reach + 1, 1, reach)
 
 
 def _gather(maps: Tensor, texel: Tensor) -> Tensor:
