@@ -151,18 +151,19 @@ def load_head_scene(head: HeadModel, width: int, height: int, light: Light, inte
         )
     mi = load_mitsuba()
     mesh = seam_mesh(head)
-    # Scene files take meshes and textures by file name only; the files are read at once and can go.
+    # Scene files take meshes and textures by file name only; the files are read at once and can go. Pictures as .pfm:
+    # where there is one core, Mitsuba 3.9 waits for ever on threads that unpack .exr files.
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        files = {"mesh": folder / "head.ply", "texture": folder / "texture.exr"}
+        files = {"mesh": folder / "head.ply", "texture": folder / "texture.pfm"}
         _write_mesh(head.template.numpy()[mesh.source], mesh.faces, mesh.texcoords, files["mesh"])
         mi.Bitmap(np.full((2, 2, 3), _DEFAULT_ALBEDO, np.float32)).write(str(files["texture"]))
         if light != "flat":
-            files |= {"glasses": folder / "glasses.ply", "roughness": folder / "roughness.exr"}
+            files |= {"glasses": folder / "glasses.ply", "roughness": folder / "roughness.pfm"}
             _write_mesh(*glasses_topology(), None, files["glasses"])
             mi.Bitmap(np.full((2, 2, 1), _DEFAULT_ROUGHNESS, np.float32)).write(str(files["roughness"]))
         if light == "environment":
-            files["environment"] = folder / "environment.exr"
+            files["environment"] = folder / "environment.pfm"
             mi.Bitmap(plain_sky()).write(str(files["environment"]))
         scene = mi.load_file(
             str(_FOLDER / f"{light}.xml"),

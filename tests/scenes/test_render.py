@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from scenes.head_scene import load_head_scene
 from tests.heads import sphere_head
 from uika.head import Camera, HeadModel, HeadParameters, look_at, pose_vertices, project, rasterize
 
+ROOT = Path(__file__).resolve().parents[2]
 Images = dict[str, np.ndarray]
 
 
@@ -157,3 +160,16 @@ def test_built_in_head_renders_like_the_rasterizer() -> None:
     xy, z = project(head.template, camera)
     triangle, _ = rasterize(xy, head.faces, 96, 96, z, cull="none")
     assert (triangle.numpy() == images["triangle"]).mean() > 0.995
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no way to give a process one core")
+@pytest.mark.parametrize("light", ["flat", "environment"])
+def test_one_core_is_enough(light: str) -> None:
+    """Mitsuba's own reading and writing of .exr files needs a second thread and would wait for ever."""
+    program = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "from scenes.head_scene import load_head_scene; from tests.heads import sphere_head\n"
+        f"scene = load_head_scene(sphere_head(rows=7, columns=10), 16, 16, '{light}', 'path'); print('loaded')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=90)
+    assert done.stdout.strip().endswith("loaded"), done.stderr
