@@ -23,6 +23,7 @@ COMMANDS: Mapping[str, str] = {
     "stress_catalogue": "python -m tests.stress.report",
     "stress_faults": "python -m tests.stress.report",
     "stress_fuzz": "python -m tests.stress.report",
+    "stress_fuzz_readers": "python -m tests.stress.fuzz --count 20000 --seed 2",
     "stress_scenes": "python -m tests.stress.report",
     "synthesis_people": "python -m benchmarks.synthesis_quality",
     "training": "python -m benchmarks.training --data people",

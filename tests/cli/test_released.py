@@ -67,7 +67,8 @@ def test_bfloat16_gives_nearly_the_same(folder: Path, avatar: Avatar, capsys: py
     assert main(["reconstruct", str(PORTRAIT), *given]) == 0
     half = Avatar.load(folder / "half.safetensors")
     assert half.provenance["model"] == "released (uika.safetensors) in bfloat16"
-    assert 0 < float((half.means - avatar.means).abs().max()) < 3e-3
+    # Eight bits of an offset of up to 0.2 m, and a network of random values before it: machines differ by a tenth.
+    assert 0 < float((half.means - avatar.means).abs().max()) < 5e-3
     assert float((half.colors - avatar.colors).abs().mean()) < 0.01
     none = ["--precision", "bfloat16", "-o", str(folder / "none.safetensors")]
     assert main(["reconstruct", str(PORTRAIT), *none]) == 2

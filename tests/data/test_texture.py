@@ -42,9 +42,10 @@ def test_atlas_loss_is_zero_for_the_truth_and_counts_known_texels_alone() -> Non
     texture = torch.rand(4, size, size, generator=torch.Generator().manual_seed(0))
     texture[3] = (texture[3] > 0.5).float()
     truth = texture.flatten(1)[:, texel].mT
-    assert float(task._atlas(truth[:, :3], texture)) == 0
+    even = torch.ones(len(truth))
+    assert float(task._atlas(truth[:, :3], texture, even)) == 0
     shifted = truth[:, :3] + 0.25 * truth[:, 3:] + 9 * (1 - truth[:, 3:])
-    assert abs(float(task._atlas(shifted, texture)) - 0.25) < 1e-6
+    assert abs(float(task._atlas(shifted, texture, even)) - 0.25) < 1e-6
 
 
 def test_a_coarser_atlas_in_training_leaves_the_model_file_at_its_own_size(tmp_path) -> None:
