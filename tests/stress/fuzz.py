@@ -27,6 +27,8 @@ from typing import Any
 
 from .targets import TARGETS
 
+ROOT = Path(__file__).resolve().parents[2]
+TABLE = ROOT / "benchmarks" / "results" / "stress_fuzz_readers.md"
 MEMORY = 1 << 30  # bytes that reading a damaged file may take at once
 SECONDS = 10  # of processor time, so that a busy machine makes no findings
 COLLECTED = 40  # files after which memory is tidied up: threads of PyAV's decoders live until then
@@ -159,13 +161,32 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=1000, help="files of each target")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kept", type=Path, default=Path("out/fuzz"), help="folder for files that cause findings")
+    parser.add_argument("--table", action="store_true", help=f"write {TABLE.relative_to(ROOT)}")
     arguments = parser.parse_args(argv)
-    bad = False
+    results = []
     for name in arguments.targets:
-        result = fuzz(name, arguments.count, arguments.seed, arguments.kept)
-        bad |= bool(result.findings)
-        print(json.dumps(asdict(result) | {"count": arguments.count}), flush=True)
-    return int(bad)
+        results.append(fuzz(name, arguments.count, arguments.seed, arguments.kept))
+        print(json.dumps(asdict(results[-1]) | {"count": arguments.count}), flush=True)
+    if arguments.table:
+        TABLE.write_text(table(results), encoding="utf-8")
+    return int(any(result.findings for result in results))
+
+
+def table(results: list[Result]) -> str:
+    """What became of every target, as the page on security shows it."""
+    lines = [
+        "# Damaged files: readers added or changed",
+        "",
+        f"{sum(result.count for result in results):,} damaged files.",
+        "",
+        "| reader | files | read | refused by name | findings | slowest, s | most memory, MiB |",
+        "|" + " --- |" * 7,
+    ]
+    lines += [
+        f"| {r.target} | {r.count:,} | {r.read:,} | {r.refused:,} | {len(r.findings)} | {r.slowest:.2f} | {r.grown} |"
+        for r in sorted(results, key=lambda result: result.target)
+    ]
+    return "\n".join([*lines, ""])
 
 
 if __name__ == "__main__":
