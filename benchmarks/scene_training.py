@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=256)
-    parser.add_argument("--steps", type=int, default=7000)
+    parser.add_argument("--steps", type=int, default=3500)
     parser.add_argument("--splats", type=int, default=30_000)
     parser.add_argument("--folder", type=Path, default=Path("out/scene_training"))
     arguments = parser.parse_args(argv)
