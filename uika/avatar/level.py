@@ -10,7 +10,7 @@ from torch import Tensor
 
 from uika.avatar import Avatar
 from uika.head import Camera
-from uika.head.rotations import matrices_to_quaternions
+from uika.head.rotations import matrices_to_quaternions, quaternions_to_matrices
 
 NEAR = 2.5  # times the mean of both scales: what lies farther apart is not merged
 SPREAD = 2.0  # of the pair's distance in its covariance: by both Gaussians alone (1) skin shows a grain of gaps
@@ -91,11 +91,5 @@ def _area(avatar: Avatar, index: Tensor) -> Tensor:
 
 
 def _covariances(avatar: Avatar, index: Tensor) -> Tensor:
-    w, x, y, z = torch.nn.functional.normalize(avatar.quats[index], dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    turned = torch.stack([torch.stack(row, -1) for row in rows], -2) * avatar.scales[index][:, None, :]
+    turned = quaternions_to_matrices(avatar.quats[index]) * avatar.scales[index][:, None, :]
     return turned @ turned.mT

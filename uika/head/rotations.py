@@ -36,6 +36,17 @@ def multiply_quaternions(first: Tensor, second: Tensor) -> Tensor:
     )
 
 
+def quaternions_to_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [...,3,3] of wxyz quaternions [...,4] of any length but 0."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
 def quaternion_components(matrix: Tensor) -> Tensor:
     """Quaternions [4,...] (wxyz, any sign, any length but 0) of rotations [3,3,...]; components first for speed."""
     xx, yy, zz = matrix[0, 0], matrix[1, 1], matrix[2, 2]

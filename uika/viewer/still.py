@@ -13,6 +13,7 @@ from torch import Tensor
 from uika.avatar import Avatar
 from uika.avatar.rendering import render
 from uika.head import Camera, HeadModel, HeadParameters
+from uika.head.rotations import quaternions_to_matrices
 from uika.metrics import psnr
 from uika.viewer.live import UNITS
 
@@ -46,15 +47,7 @@ def compare(
 
 def camera_of(view: tuple[Any, Any, float], width: int, height: int) -> Camera:
     """A camera in metres from the browser's rotation, position and field of view."""
-    w, x, y, z = (float(value) for value in view[0])
-    turn = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    turn = quaternions_to_matrices(torch.as_tensor(np.asarray(view[0]), dtype=torch.float64))
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = turn.T
     viewmat[:3, 3] = -turn.T @ torch.as_tensor(np.asarray(view[1]), dtype=torch.float64) / UNITS
